@@ -21,10 +21,17 @@ by_jaxtyping = jaxtyping.jaxtyped
 CHECKS: dict[CodeType, FunctionType] = {}
 """A function with a check, by the code of the function."""
 CALLS = 3  # of a function that are checked in each test
-LEFT: dict[CodeType, int] = {}
-"""Number of calls that are still to be checked in this test, by the code of the function, if not
-`CALLS`.
-"""
+LEFT: dict[CodeType, list[int]] = {}
+"""Number of calls that are still to be checked in this test, by the code of the function."""
+BEGUN: list[list[int]] = []
+"""Those numbers of `LEFT` that are less than `CALLS`."""
+
+
+def check_anew() -> None:
+    """Check annotations of the first calls of the next test, too."""
+    for left in BEGUN:
+        left[0] = CALLS
+    BEGUN.clear()
 
 
 def jaxtyped(thing: Any = None, **options: Any) -> Any:
@@ -48,14 +55,18 @@ def with_check(thing: FunctionType) -> Callable[..., Any]:
     anew.
     """
     checked = None
-    code = thing.__code__
+    left = LEFT.setdefault(thing.__code__, [CALLS])  # a code is slow to look up at each call
+    if not left[0]:  # of a nested function, which is made anew
+        return thing
 
     @functools.wraps(thing)
     def call(*args: Any, **kwargs: Any) -> Any:
         nonlocal checked
-        if not (left := LEFT.get(code, CALLS)):
+        if not left[0]:
             return thing(*args, **kwargs)
-        LEFT[code] = left - 1
+        if left[0] == CALLS:
+            BEGUN.append(left)
+        left[0] -= 1
         checked = checked or bound(thing)
         push_shape_memo({})
         try:

@@ -13,9 +13,7 @@ import torch
 from hypothesis import HealthCheck, settings
 from torch import Tensor
 
-from tests import annotations
-from tests.kept import kept as kept
-from tests.kept import kept_plans as kept_plans
+from tests import annotations, kept
 
 if TYPE_CHECKING:
     from torchgrasp.values.planning import PointCloud
@@ -26,6 +24,7 @@ os.environ.pop(
 sys.dont_write_bytecode = False
 
 annotations.install()
+gc.disable()  # until all tests are collected: hardly any of what that makes is garbage
 
 collect_ignore = [
     "app/agent_client.py",
@@ -50,6 +49,11 @@ SIMULATED = re.compile(
 """What an example calls that opens a simulator."""
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Give its fixtures to the examples of the library, which are not below this folder."""
+    config.pluginmanager.register(kept)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the examples of docstrings that simulate, as tests that do are marked."""
     for item in items:
@@ -67,11 +71,12 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(*GARBAGE)
+    gc.enable()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Check annotations of the first calls of the next test, too."""
-    annotations.LEFT.clear()
+    annotations.check_anew()
 
 
 @pytest.fixture

@@ -83,6 +83,13 @@ def kept() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True)
+def examples_once(request: pytest.FixtureRequest) -> None:
+    """Do so in the examples of docstrings."""
+    if isinstance(request.node, pytest.DoctestItem):
+        request.getfixturevalue("kept")
+
+
 @pytest.fixture(scope="module")
 def kept_plans(kept: None) -> Iterator[None]:
     """Plan for each request once; an observer hears the stages of the first plan."""

@@ -362,8 +362,10 @@ def halved(image: Tensor) -> Tensor:
 
 
 @functools.cache
-def see(*boxes: tuple[float, ...], pose: Tensor | None = None) -> Scene:
-    """Return the scene of boxes (x, y, width, height) on the table, or (x, y, width, height, foot)."""
+def see(*boxes: tuple[float, ...], pose: Tensor | None = None, half: bool = True) -> Scene:
+    """Return the scene of boxes (x, y, width, height) on the table, or (x, y, width, height, foot),
+    at half resolution or in full.
+    """
     meshes = []
     for x, y, width, height, *foot in boxes:
         mesh = trimesh.creation.box([width, width, height])
@@ -371,6 +373,9 @@ def see(*boxes: tuple[float, ...], pose: Tensor | None = None) -> Scene:
         meshes.append(mesh)
     camera = look_at(20.0, 45.0, 0.7)
     depth, labels = render_depth(meshes, camera)
+    intrinsics = INTRINSICS
+    if half:
+        depth, labels, intrinsics = halved(depth), halved(labels), HALF
     return Scene.from_depth(
-        depth, INTRINSICS, camera if pose is None else pose @ camera, labels=labels
+        depth, intrinsics, camera if pose is None else pose @ camera, labels=labels
     )

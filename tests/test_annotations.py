@@ -5,7 +5,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tests.annotations import CALLS, LEFT, jaxtyped
+from tests.annotations import CALLS, check_anew, jaxtyped
+from torchgrasp.geometry.linalg import limit_norm, solve_least_squares
 
 
 def test_each_call_of_a_nested_function_is_checked():
@@ -25,7 +26,7 @@ def test_each_call_of_a_nested_function_is_checked():
     two = make(2)
     none = make(0)
     for n in (2, 3):
-        LEFT.clear()
+        check_anew()
         assert (
             one(torch.zeros(n)).sum() == n and two(torch.zeros(n), z=torch.ones(n)).sum() == 2 * n
         )
@@ -35,7 +36,7 @@ def test_each_call_of_a_nested_function_is_checked():
         lambda: two(torch.zeros(2), y=3),
         lambda: none(torch.zeros(2)),
     ):
-        LEFT.clear()
+        check_anew()
         with pytest.raises(TypeError):
             call()
 
@@ -51,7 +52,7 @@ def test_the_first_calls_of_each_test_are_checked():
         with pytest.raises(TypeError):
             checked(torch.zeros(2, 2))
     assert checked(torch.zeros(2, 2)).shape == (2, 2)
-    LEFT.clear()  # as conftest.py does before each test
+    check_anew()  # as conftest.py does before each test
     with pytest.raises(TypeError):
         checked(torch.zeros(2, 2))
 
@@ -65,3 +66,23 @@ def test_the_library_is_checked_in_this_way():
     assert rigid(torch.eye(3), torch.zeros(3)).shape == (4, 4)
     with pytest.raises(TypeError):
         rigid(torch.eye(3)[None], torch.zeros(3))  # torch raises another error
+
+
+ROWS = torch.ones(4, 2, dtype=torch.float64)
+VALUES = torch.ones(4, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(VALUES, VALUES), (ROWS, VALUES[:3]), (ROWS.long(), VALUES)],
+    ids=["rank", "letter", "type"],
+)
+def test_tests_check_annotations_of_tensors(arguments):
+    with pytest.raises(TypeError):
+        solve_least_squares(*arguments)
+
+
+def test_tests_check_annotations_and_let_right_arguments_pass():
+    assert solve_least_squares(torch.rand(4, 2).double(), VALUES).shape == (2,)
+    with pytest.raises(TypeError):
+        limit_norm(ROWS, "1")  # pyright: ignore[reportArgumentType]

@@ -6,7 +6,9 @@ JSON.
 """
 
 import contextlib
+import functools
 import importlib.machinery
+import inspect
 import io
 import json
 import os
@@ -38,6 +40,8 @@ def replace_absent() -> None:
 
 if os.environ.get("LEROBOT_REPLACE"):
     replace_absent()
+# LeRobot's programs read the source of each of their options anew for the help, which is not shown
+inspect.getsource = functools.cache(inspect.getsource)
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: E402
 from lerobot.robots import RobotConfig  # noqa: E402

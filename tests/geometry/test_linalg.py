@@ -121,26 +121,6 @@ def test_least_squares_have_the_same_bits_in_every_call(generator):
         assert torch.equal(solve_least_squares(rows, values), first)
 
 
-ROWS = torch.ones(4, 2, dtype=torch.float64)
-VALUES = torch.ones(4, dtype=torch.float64)
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [(VALUES, VALUES), (ROWS, VALUES[:3]), (ROWS.long(), VALUES)],
-    ids=["rank", "letter", "type"],
-)
-def test_tests_check_annotations_of_tensors(arguments):
-    with pytest.raises(TypeError):
-        solve_least_squares(*arguments)
-
-
-def test_tests_check_annotations_and_let_right_arguments_pass():
-    assert solve_least_squares(torch.rand(4, 2).double(), VALUES).shape == (2,)
-    with pytest.raises(TypeError):
-        limit_norm(ROWS, "1")  # pyright: ignore[reportArgumentType]
-
-
 @pytest.mark.parametrize("dtype", [torch.int64, torch.float64])
 def test_rows_are_numbered_as_torch_does_however_large_their_numbers_are(dtype, generator):
     rows = torch.randint(-3, 3, (200, 3), generator=generator).to(dtype)

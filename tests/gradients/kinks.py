@@ -54,8 +54,11 @@ def solids() -> Iterator[Inputs]:
 
 
 def all_figures(_: Inputs) -> Iterator[Inputs]:
-    for points, normals in itertools.chain(*map(figures, (3, 4, 5)), solids()):
-        yield points[None], normals[None]
+    """Yield all figures with the same number of contacts as the rows of one batch."""
+    found = [*itertools.chain(*map(figures, (3, 4, 5)), solids())]
+    for count in (3, 4, 5):
+        alike = [figure for figure in found if len(figure[0]) == count]
+        yield tuple(map(torch.stack, zip(*alike, strict=True)))
 
 
 def tilted(_: Inputs) -> Iterator[Inputs]:

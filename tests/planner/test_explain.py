@@ -191,7 +191,7 @@ def test_a_disc_too_low_needs_its_table_gone_and_an_object_under_another_the_oth
         and "no table" in explanation.best.words
         and not explanation.best.choice
     )
-    scene = see((0.0, 0.0, 0.09, 0.06), (0.0, 0.0, 0.07, 0.05, 0.06)).select(1)
+    scene = see((0.0, 0.0, 0.09, 0.06), (0.0, 0.0, 0.07, 0.05, 0.06), half=False).select(1)
     explanation = explain_empty(scene, load_hand("barrett"), starts=8)
     assert explanation.best is not None and "taken away first" in explanation.best.words
 

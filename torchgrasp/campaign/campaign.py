@@ -136,7 +136,7 @@ def run_campaign(
     >>> meshes = Path(tempfile.mkdtemp())
     >>> _ = trimesh.creation.cylinder(radius=0.03, height=0.12).export(meshes / "tin.stl")
     >>> _ = write_objects(meshes, meshes / "objects", views=1)
-    >>> spec = CampaignSpec("dexgraspbench", EvaluationSpec(1, starts=20))
+    >>> spec = CampaignSpec("dexgraspbench", EvaluationSpec(1, starts=8))
     >>> data = run_campaign(meshes / "objects", load_hand("barrett"), meshes / "data", spec)
     >>> [(row.object, row.status.name) for row in data.jobs], len(data)
     ([('tin', 'OK')], 1)

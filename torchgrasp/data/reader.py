@@ -182,7 +182,7 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     >>> folder = Path(tempfile.mkdtemp())
     >>> _ = trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "carton.ply")
     >>> _ = write_objects(folder, folder / "objects", views=1)
-    >>> spec = CampaignSpec("dexgraspbench", EvaluationSpec(1, starts=20))
+    >>> spec = CampaignSpec("dexgraspbench", EvaluationSpec(1, starts=8))
     >>> _ = run_campaign(folder / "objects", load_hand("barrett"), folder / "data", spec)
     >>> data = read_shards(folder / "data", points=100)
     >>> data[0]["points"].shape, data.jobs[0].object, data.job(0).row.grasps

@@ -1,6 +1,7 @@
 """The objects that are shipped with the library: meshes, convex parts and noisy views."""
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -90,10 +91,16 @@ def load_object(name: str) -> GraspObject:
     if name not in MASSES:
         raise BadArgument("name", repr(name), f"one of {', '.join(MASSES)}")
     mesh = trimesh.load_mesh(DATA / name / "mesh.ply")
+    parts = [part.copy() for part in _read_parts(name)]
+    return GraspObject(name, mesh, parts, read_cloud(DATA / name / "view.ply"), MASSES[name])
+
+
+@functools.cache
+def _read_parts(name: str) -> "tuple[trimesh.Trimesh, ...]":
+    """Return the convex parts of a shipped object, made once: hulls take most of the time."""
     with np.load(DATA / name / "parts.npz", allow_pickle=False) as file:
         corners = np.split(file["corners"].astype(np.float64), np.cumsum(file["counts"])[:-1])
-    parts = [trimesh.convex.convex_hull(c) for c in corners]
-    return GraspObject(name, mesh, parts, read_cloud(DATA / name / "view.ply"), MASSES[name])
+    return tuple(map(trimesh.convex.convex_hull, corners))
 
 
 @checked

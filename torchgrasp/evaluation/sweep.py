@@ -76,7 +76,7 @@ def evaluate(
     >>> _ = load_object("cylinder").mesh.export(folder / "tin.ply")
     >>> _ = write_objects(folder, folder / "objects", views=1)
     >>> spec = EvaluationSpec(1, starts=10)
-    >>> scores = evaluate(folder / "objects", load_hand("barrett"), "tabletop", spec)
+    >>> scores = evaluate(folder / "objects", load_hand("barrett"), "dexgraspbench", spec)
     >>> [score.executable > 0 for score in scores]
     [True]
     """

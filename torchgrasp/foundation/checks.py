@@ -325,7 +325,8 @@ def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
         raise BadArgument(name, f"shape {tuple(value.shape)}", allowed)
     if value.dtype not in (dtypes := DTYPES.get(kind) or sum(DTYPES.values(), ())):
         raise BadArgument(name, str(value.dtype), " or ".join(map(str, dtypes)))
-    check_dense(name, value, call.gradients)
+    if not call.gradients:
+        check_dense(name, value, gradients=False)
     call.sizes.update(sizes)
     if value.is_inference():  # torch refuses it where derivatives are taken
         value = value.clone()

@@ -185,7 +185,7 @@ def check_dense(name: str, value: Tensor, gradients: bool) -> None:
         raise BadArgument(
             name, "a tensor with the negative bit", f"one without: {name}.resolve_neg()"
         )
-    if is_tracked(value) and not gradients:
+    if not gradients and is_tracked(value):
         raise BadArgument(
             name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()"
         )

@@ -309,7 +309,7 @@ def explain_empty(
     >>> from torchgrasp import load_hand, load_object
     >>> spec = ContactSpec(friction=0.0, table=0.0)
     >>> cloud, hand = load_object("cylinder").view, load_hand("barrett")
-    >>> explanation = explain_empty(cloud, hand, spec, starts=20)
+    >>> explanation = explain_empty(cloud, hand, spec, starts=6)
     >>> explanation.best.words
     'if the friction were 0.4 instead of 0'
     """

@@ -93,7 +93,7 @@ def plan_grasps(
     first.
 
     >>> from torchgrasp import load_object
-    >>> grasps = plan_grasps(load_object("cylinder"), "barrett", ContactSpec(table=0.0), starts=20)
+    >>> grasps = plan_grasps(load_object("cylinder"), "barrett", ContactSpec(table=0.0), starts=8)
     >>> grasps.joints.shape[1]
     4
 
@@ -227,7 +227,7 @@ def stream_grasps(
     of what the points show, such as a wrong size, are raised at the first iteration.
 
     >>> from torchgrasp import load_hand, load_object
-    >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=40))
+    >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=12))
     >>> bool((first.status == 0).all())
     True
     """
