@@ -228,7 +228,8 @@ def share_of_holes(points: Tensor, eye: Tensor) -> float:
     depth = local @ forward
     down = torch.linalg.cross(forward, right)
     pixels = torch.stack([local @ right / depth, local @ down / depth], 1)
-    cell = 2 * float(nearest(pixels, 2)[0][:, 1].median())
+    pitch = np.median(KDTree(pixels.numpy()).query(pixels.numpy(), k=2)[0][:, 1])
+    cell = 2 * float(pitch)
     column, row = (torch.round((pixels - pixels.amin(0)) / cell).long() + CLOSED).T
     seen = np.zeros((int(row.max()) + CLOSED + 1, int(column.max()) + CLOSED + 1), dtype=bool)
     seen[row.numpy(), column.numpy()] = True
