@@ -13,7 +13,7 @@
 
 * scene: real, rooms, target: supports and things in depth images, a given thing among others
 
-* shape: objects, views: the estimated shape against true meshes; what more views bring
+* shape: objects, views, residuals: errors of shapes; what more views bring; how bad clouds are
 
 Each bench prints rows, and writes them as JSON and as a Markdown table with commit, machine and
 command. A run that was stopped goes on: rows of the same commit and options are kept in --out.

@@ -61,7 +61,8 @@ class Options:
         scale: factor of the numbers of random samples, scenes, frames, plans and trials.
         draws: trials of each grasp of close/table-lift, with other displacements and noise.
         tries: most grasps that a trial of close/table-lift tries; by default as the protocol says.
-        clouds: folder of real clouds NAME_CAMERA.ply for headline/shape, of one camera each.
+        clouds: folder of real clouds NAME_CAMERA.ply for headline/real and shape/residuals, of one
+            camera each.
         planned: folder OBJECT/VIEW.safetensors with grasps for close/table-lift; by default they
             are planned and kept.
         simulator: of close/table-lift.

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.ndimage import gaussian_filter
 
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
 from torchgrasp.cloud.sensor import (
@@ -56,7 +57,7 @@ def test_the_noise_of_a_kinect_is_that_of_its_paper():
 @pytest.mark.parametrize("name", NAMES)
 def test_the_bias_is_smooth_and_of_its_size(name):
     noise = dataclasses.replace(
-        sensor(name), disparity=0.0, step=1e-6, floor=0.0, growth=0.0, lost=0.0
+        sensor(name), disparity=0.0, fine=0.0, step=1e-6, floor=0.0, growth=0.0, lost=0.0, holes=0.0
     )
     errors = wall(0.8, noise).reshape(240, 320)
     assert float(errors.std()) == pytest.approx(noise.bias, rel=0.05)
@@ -86,6 +87,74 @@ def test_the_second_camera_misses_a_strip_beside_a_nearer_surface():
         range(int(missing[0]), 100)
     )  # up to the nearer surface's left rim
     assert len(missing) == pytest.approx(30.0 * (1 / 0.5 - 1 / 1.0), abs=2)
+
+
+EXACT = SensorNoise(30.0, bias=0.0, flying=0.0, lost_rim=0.0, lost=0.0, grazing=(89.0, 90.0))
+
+
+def measure(depth, noise: SensorNoise, seed: int = 0):
+    return add_noise(depth, torch.ones_like(depth), torch.Generator().manual_seed(seed), noise)
+
+
+def test_smoothing_blurs_a_surface_and_neither_a_plane_nor_what_is_behind_a_jump():
+    noise = dataclasses.replace(EXACT, smoothing=3.0)
+    row, column = torch.meshgrid(*(torch.arange(n).double() for n in (60, 120)), indexing="ij")
+    roof = 0.6 + 1e-3 * (column - 60).abs()  # edges of 1 mm a pixel
+    inner = slice(20, 40), slice(30, 90)
+    expected = torch.from_numpy(gaussian_filter(roof.numpy(), 3.0))
+    assert (measure(roof, noise) - expected)[inner].abs().max() < 3e-5
+    # the edge is rounded by width * sqrt(2 / pi) of the blurred |x|
+    assert float(measure(roof, noise)[30, 60] - 0.6) == pytest.approx(
+        3e-3 * math.sqrt(2 / math.pi), rel=0.03
+    )
+    plane = 0.6 + 1e-3 * column + 5e-4 * row
+    assert (measure(plane, noise) - plane)[inner].abs().max() < 1e-6
+    two = torch.where(column < 60, 0.5, 0.8).double()
+    torch.testing.assert_close(measure(two, noise), two)
+    gone = torch.where(column < 60, 0.5, 0.0).double()
+    torch.testing.assert_close(measure(gone, noise), gone)
+
+
+def test_worn_rims_are_strips_that_differ_by_view_and_have_their_mean_width():
+    row, column = torch.meshgrid(*(torch.arange(300).double() for _ in range(2)), indexing="ij")
+    radius = 100.0
+    disc = (row - 150) ** 2 + (column - 150) ** 2 < radius**2
+    depth = torch.where(disc, 0.6, 0.0).double()
+    worn = 5.0
+    noise = dataclasses.replace(EXACT, worn=worn, hole_width=5.0)
+    left = [int((measure(depth, noise, seed) > 0).sum()) for seed in range(40)]
+    strips = torch.tensor([radius - math.sqrt(count / math.pi) for count in left])
+    # a width below 0 takes nothing away, which adds a twelfth to the mean of a normal one
+    assert float(strips.mean()) == pytest.approx(1.083 * worn, rel=0.3)
+    assert float(strips.min()) < 0.4 * worn and 1.5 * worn < float(strips.max()) < 2.5 * worn
+    whole = torch.full((40, 40), 0.6, dtype=torch.float64)
+    torch.testing.assert_close(measure(whole, noise), whole)
+
+
+def test_holes_are_patches_and_have_their_share():
+    depth = torch.full((400, 400), 0.6, dtype=torch.float64)
+    lost = measure(depth, dataclasses.replace(EXACT, holes=0.1, hole_width=4.0)) == 0
+    assert float(lost.double().mean()) == pytest.approx(0.1, rel=0.25)
+    beside = lost[:, 1:][lost[:, :-1]]
+    assert beside.double().mean() > 0.7  # of independent pixels it is 0.1
+
+
+def test_a_cropped_and_misplaced_view_is_cut_above_its_foot_and_moved_with_its_camera():
+    pose = look_at(20.0, 30.0, target=BRICK)
+    plain = partial_view(BRICK, pose, n=100000, noise=EXACT)
+    cut = partial_view(BRICK, pose, n=100000, noise=dataclasses.replace(EXACT, crop=0.02))
+    assert float(plain.points[:, 2].min()) < 0.001
+    assert 0.02 < float(cut.points[:, 2].min()) < 0.021
+    assert len(cut) == int((plain.points[:, 2] > 0.02).sum())
+    moved = dataclasses.replace(EXACT, misplaced=0.003)
+    shifts = []
+    for seed in range(40):
+        cloud = partial_view(BRICK, pose, n=100000, noise=moved, seed=seed)
+        assert cloud.viewpoint is not None
+        shifts.append(cloud.viewpoint.double() - pose[:3, 3])
+        middle = cloud.points.double().mean(0) - plain.points.double().mean(0)
+        torch.testing.assert_close(middle, shifts[-1], rtol=0.0, atol=1e-6)
+    assert float(torch.stack(shifts).std()) == pytest.approx(0.003, rel=0.25)
 
 
 def test_a_camera_is_chosen_by_name_or_by_its_noise():

@@ -112,7 +112,8 @@ def partial_view(
         n: number of points, at least 4, drawn at random from the measured pixels. If there are
             fewer pixels, all are returned.
         noise: True for the default noise, False for exact depths, a camera's name ("realsense",
-            "kinect_v1", "azure" or "zivid"), or a `SensorNoise`.
+            "kinect_v1", "azure" or "zivid"), or a `SensorNoise`. "realsense_cloud" is a public
+            cloud of a RealSense: smoothed, cropped, with holes and a calibration error.
         seed: seed of the noise and of the choice of points.
 
     Raises:
@@ -129,10 +130,29 @@ def partial_view(
     pose = check_rigid("camera_pose", camera_pose).double()
     depth, cosine = cast_mesh(mesh, pose)
     generator = torch.Generator().manual_seed(seed)
-    if (sensor := find_sensor(noise)) is not None:
+    sensor = find_sensor(noise)
+    if sensor is not None:
         depth = add_noise(depth, cosine, generator, sensor)
     cloud = cloud_from_depth(depth, INTRINSICS, camera_pose=pose)
+    if sensor is not None:
+        cloud = _crop_and_move(cloud, float(mesh.bounds[0, 2]), sensor, generator)
     return cloud.select(torch.randperm(len(cloud), generator=generator)[:n])
+
+
+def _crop_and_move(
+    cloud: PointCloud, lowest: float, sensor: SensorNoise, generator: torch.Generator
+) -> PointCloud:
+    """Return a cloud without what was cut away above the `lowest` height [m], where a calibration
+    puts it.
+    """
+    if sensor.crop:
+        cloud = cloud.select(cloud.points[:, 2] > lowest + sensor.crop)
+    if not sensor.misplaced or cloud.viewpoint is None:
+        return cloud
+    shift = sensor.misplaced * torch.randn(3, generator=generator, dtype=torch.float64)
+    points = cloud.points + shift.to(cloud.points)
+    eye = cloud.viewpoint + shift.to(cloud.viewpoint)
+    return dataclasses.replace(cloud, points=points, viewpoint=eye)
 
 
 def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Image, Image]:

@@ -22,7 +22,7 @@ from torchgrasp.foundation.lazy import ndimage, optimize
 from torchgrasp.geometry.plane import Plane
 
 Image = Float[Tensor, "h w"]
-SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
+SensorName = Literal["realsense", "realsense_cloud", "kinect_v1", "azure", "zivid"]
 """Depth cameras with a model of their noise."""
 
 
@@ -40,6 +40,12 @@ class FaultNumbers:
     """Width of the surroundings [px] whose light reaches a corner."""
     deepest: float = 0.01
     """Greatest depth [m] of a corner behind its surroundings; a deeper pixel is no corner."""
+    fine: float = 0.5
+    """Width [px] of patches of fine noise: neighbours are alike, and the next ones hardly."""
+    spread: float = 0.2
+    """Share of the difference to each neighbour that a step of smoothing takes away: stable below a
+    quarter, and each step adds twice this share to the variance [px^2].
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,6 +122,18 @@ class SensorNoise(Value):
             and at which all are missing.
         multipath: error of a time-of-flight camera in a corner (no unit). The measured depth is too
             great by this factor times the corner's depth behind its surroundings.
+        fine: standard deviation of a second disparity noise [px], in patches of a pixel; only with
+            a `base`.
+        smoothing: standard deviation [px] of the blur by the matching window, within each surface:
+            it rounds edges.
+        worn: mean width [px] of the strip that is lost along rims. Each view has its own, up to
+            twice as much, and it waves as wide as holes are.
+        holes: share [0 to 1] of pixels that are lost in patches, as on dark and shiny parts.
+        hole_width: width [px] of these patches.
+        crop: height [m] above the lowest point, along z of the frame of `partial_view`, below which
+            whoever cut the table away took the object, too. Depth images are not cropped.
+        misplaced: standard deviation [m] on each axis by which a calibration is off, which
+            moves the points of `partial_view` with their camera. Depth images do not move.
 
     >>> float(SENSORS["kinect_v1"].sigma(torch.tensor(2.0))) < 0.007
     True
@@ -136,6 +154,13 @@ class SensorNoise(Value):
     lost: float = 0.01
     grazing: tuple[float, float] = (72.5, 87.0)
     multipath: float = 0.0
+    fine: float = 0.0
+    smoothing: float = 0.0
+    worn: float = 0.0
+    holes: float = 0.0
+    hole_width: float = 5.0
+    crop: float = 0.0
+    misplaced: float = 0.0
 
     @checked
     def sigma(self, depth: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
@@ -143,7 +168,8 @@ class SensorNoise(Value):
 
         It contains neither the bias nor the rounding of the disparity. b stands for any batch axes.
         """
-        growth = self.disparity / self.base if self.base else self.growth
+        disparity = math.hypot(self.disparity, self.fine)
+        growth = disparity / self.base if self.base else self.growth
         return torch.sqrt(self.floor**2 + (growth * depth * depth) ** 2)
 
 
@@ -157,6 +183,28 @@ SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType(
         # as in public frames.
         "realsense": SensorNoise(
             30.8, 0.08, 1 / 32, grain=5.0, bias=0.0015, bias_width=18.0, shadow=True
+        ),
+        # The same as clouds of things come from other people: fitted to what the clouds of 7 things
+        # by a D435 and a D455 show by themselves (`scripts/bench.py shape --only residuals`).
+        "realsense_cloud": SensorNoise(
+            30.8,
+            0.08,
+            1 / 32,
+            grain=4.0,
+            bias=0.003,
+            bias_width=14.0,
+            shadow=True,
+            flying=0.0,
+            lost_rim=0.0,
+            lost=0.0,
+            grazing=(55.0, 75.0),
+            fine=0.035,
+            smoothing=2.5,
+            worn=1.2,
+            holes=0.03,
+            hole_width=5.0,
+            crop=0.004,
+            misplaced=0.0015,
         ),
         # Khoshelham and Oude Elberink 2012: 0.00143 z^2 in all, steps of 1/8 px; 580 px and 75 mm.
         "kinect_v1": SensorNoise(
@@ -205,8 +253,12 @@ def add_noise(
     measured = depth > 0
     own = patches(1.0, sensor.grain) if sensor.grain else normal()
     noisy = torch.where(measured, depth, 1.0)
+    if sensor.smoothing:
+        noisy = _smooth(noisy, measured, sensor.smoothing)
     if sensor.base:
         disparity = sensor.base / noisy + sensor.disparity * own
+        if sensor.fine:
+            disparity = disparity + patches(sensor.fine, FAULTS.fine)
         if sensor.step:
             disparity = torch.round(disparity / sensor.step) * sensor.step
         noisy = sensor.base / disparity.clamp_min(sensor.step)
@@ -230,12 +282,48 @@ def add_noise(
     low, high = sensor.grazing
     lost = (rim & (uniform() < sensor.lost_rim)) | (uniform() < sensor.lost)
     lost = lost | (uniform() < (angle - low) / (high - low))
+    if sensor.worn:
+        edge = (full - ndimage.minimum_filter(full, 3) > FAULTS.jump) | (
+            ndimage.maximum_filter(full, 3) - full > FAULTS.jump
+        )
+        # things differ by their material: from none to twice the mean
+        mean = 2.0 * sensor.worn * torch.rand((), generator=generator, dtype=torch.float64)
+        width = mean * (1.0 + patches(1.0, sensor.hole_width))
+        if edge.any():
+            inward = torch.from_numpy(np.asarray(ndimage.distance_transform_edt(~edge)))
+            lost = lost | (inward < width)
+    if sensor.holes:
+        most = math.sqrt(2) * float(torch.special.erfinv(torch.tensor(1.0 - 2.0 * sensor.holes)))
+        lost = lost | (patches(1.0, sensor.hole_width) > most)
     if sensor.shadow:
         column = torch.arange(depth.shape[1], dtype=torch.float64)
         # column in the other eye's image
         second = column - torch.where(measured, sensor.base / depth, 0.0)
         lost = lost | (second.flip(1).cummin(1).values.flip(1) < second)
     return torch.where(measured & ~lost, noisy, 0.0)
+
+
+def _smooth(depth: Image, measured: Bool[Tensor, "h w"], width: float) -> Image:
+    """Return a depth image blurred by `width` [px] within each surface: not across a jump or the
+    border of what is measured.
+    """
+    steps = max(1, round(width**2 / (2 * FAULTS.spread)))
+    # a pixel and its neighbour below, or to the right, on one surface
+    joined = [
+        measured.narrow(axis, 1, depth.shape[axis] - 1)
+        & measured.narrow(axis, 0, depth.shape[axis] - 1)
+        & (depth.diff(dim=axis).abs() < FAULTS.jump)
+        for axis in (0, 1)
+    ]
+    for _ in range(steps):
+        change = torch.zeros_like(depth)
+        for axis, alike in enumerate(joined):
+            flow = torch.where(alike, depth.diff(dim=axis), 0.0)
+            count = flow.shape[axis]
+            change.narrow(axis, 0, count).add_(flow)
+            change.narrow(axis, 1, count).sub_(flow)
+        depth = depth + FAULTS.spread * change
+    return depth
 
 
 def estimate_noise(

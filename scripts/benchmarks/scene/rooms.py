@@ -15,12 +15,12 @@ from torch import Tensor
 
 from benchmarks.scene.scenes import scatter
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
-from torchgrasp.cloud.sensor import SENSORS, SensorName
+from torchgrasp.cloud.sensor import SensorName
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
 
-CAMERAS: tuple[SensorName, ...] = tuple(SENSORS)
+CAMERAS: tuple[SensorName, ...] = ("realsense", "kinect_v1", "azure", "zivid")
 """Cameras that take the pictures, in turn."""
 CLEARANCE = 3
 """Pixels between a lone thing and every other thing in the picture."""
