@@ -266,13 +266,16 @@ def _one_body(a: _Body, b: _Body, gap: float) -> bool:
     """Return whether two bodies are one object: they touch, one is over the other's footprint, or
     both form a rim.
     """
-    if gap == 0.0 or gap > MERGE.far:
-        return gap == 0.0
+    if gap > MERGE.far:
+        return False
     small, large = (a, b) if a.count < b.count else (b, a)
     over = small.share_over(large)
     alike = small.count > MERGE.lesser * large.count
-    side_by_side = over < MERGE.beside and small.stands and large.stands
-    apart = (side_by_side and alike) or _upon(small, large)
+    # an object before another one hides it between two ends, too
+    two_things = over < MERGE.beside and small.stands and large.stands and alike
+    if gap == 0.0 and not two_things:
+        return True
+    apart = two_things or _upon(small, large)
     if not apart and (gap < MERGE.gap or over > MERGE.nested):
         return True
     # a standing ring from its edge: none of its parts stands
