@@ -19,7 +19,8 @@ def read_scene(path: Path | str) -> Scene:
     """Read a scene from a .npz file, as `save_scene` writes it, with the checks of
     `Scene.from_depth`.
 
-    The file holds these arrays, of which only the first two are needed:
+    The file holds these arrays, of which `depth` and `intrinsics` are needed. Without
+    `camera_pose`, `labels` or `table` this argument of `Scene.from_depth` is None.
 
     * `depth` (h, w): floats in m, or whole numbers in mm.
     * `depth_unit`: metres of one count of the depth, if it is in another unit.
