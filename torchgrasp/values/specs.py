@@ -57,11 +57,12 @@ class ContactSpec(Value):
         flatness: largest angle [rad] between the normals at a contact and on a ring around it. None
             means that flatness is not checked.
         flat_radius: radius [m] of the ring. None means the largest of 8, 6, 4 and 3 mm
-            (`FLAT_RADII`) that the object allows.
+            (`FLAT_RADII`) that the object allows. `plan_grasps` then goes down to 1 mm (`RIM`) for
+            an object on a table without grasps.
         table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means no
             table.
-        tip_radius: radius [m] of the fingertips, which may rest on the table; 0 means points. None
-            means the radius of the hand's fingertips, but at least 12 mm (`TIP_RADIUS`).
+        tip_radius: radius [m] of the fingertips, balls that must stay above the table; 0 means
+            points. None means the radius of the hand's fingertips, but at least 12 mm (`TIP_RADIUS`).
         start_radius: radius, normalised, of the sphere on which initial guesses are drawn, around
             the centre of the shape's frame (Sec. 6.2).
         fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
@@ -303,7 +304,8 @@ class TrialSpec(Value):
             "uncertainty": Eqs. 25-28 with the surface's calibrated standard deviations, and with
               `options`.
             "fixed": the same with equal gains for all contacts.
-            "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
+            "paper": Eqs. 25-28 as written, with forces of a learned stability model, or analytic
+              ones if the hand's folder has no stability.safetensors.
             "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
             "position": PI control to goals behind the contacts.
             "open_loop": joint motion from pre-grasp to grasp to squeeze.
