@@ -37,7 +37,8 @@ def read_scene(path: Path | str) -> Scene:
       If it is missing, it is True.
 
     Raises `CloudFileError` for no such file, or for malformed content. Raises `BadArgument` for a
-    `target` that is no label of an object, and the errors of `Scene.from_depth`.
+    `target` that is no label of an object, or a normal not of length 1. Raises the errors of
+    `Scene.from_depth`, too.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene
