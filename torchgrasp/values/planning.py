@@ -374,8 +374,9 @@ class Grasps(Batch):
         normal_angle: angle (g, f) [rad] between the axis of a fingertip's pad and the inward normal
             of the object at its contact.
         certificate: proof of force closure (g rows).
-        score: log-odds (g,) of the predicted success, by which executable grasps are ordered. The
-            score of failed grasps is another number, which says nothing of success.
+        score: log-odds (g,) of the predicted success. Executable grasps are in its order, unless
+            the argument `ranking` of `plan_grasps` is "variance". The score of failed grasps is
+            another number, which says nothing of success.
         status: `Status` code (g,): `OK` for an executable grasp, else the reason why it failed.
         meta: names, units, hashes and the seed of the plan, as text.
         known: mask (g,) of the grasps like those of the trials to which the success model was

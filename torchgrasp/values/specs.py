@@ -44,7 +44,7 @@ class ContactSpec(Value):
     are the paper's: one unit is `ShapeGP.scale` metres.
 
     Args:
-        friction: coefficient of friction between fingertip and object at execution, or its
+        friction: coefficient of friction between fingertip and object at execution, 0 to 10, or its
             `Distribution`.
         edges: number of edges of the linearised friction cone, at least 3.
         max_variance: largest variance of the signed distance at a contact, S_thresh of Eq. (12), in
@@ -317,9 +317,10 @@ class TrialSpec(Value):
             "law": Eq. 25 continues.
             None means "grip", or "force" in three cases: `force` is given, the closing is not
               "uncertainty" or "fixed", or a fingertip has no working tactile sensor.
-        mass: mass [kg] of the object. From a `Distribution` each trial draws it by its seed.
-        friction: coefficient of friction of every contact. From a `Distribution` each trial draws
-            it by its seed.
+        mass: mass [kg] of the object, 0.001 to 10. From a `Distribution` each trial draws it by its
+            seed.
+        friction: coefficient of friction of every contact, 0 to 10. From a `Distribution` each
+            trial draws it by its seed.
         gravity: acceleration by gravity [m/s^2].
         approach: length [m] of the straight path to the pre-grasp; 0 means that the hand starts
             there.
