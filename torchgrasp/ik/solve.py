@@ -60,7 +60,7 @@ class IKSolution(Batch):
     """The hand configurations that `solve_ik` found, one for each of b contact sets.
 
     h counts actuated joints, and f fingertips. A contact set for which nothing could be tried has
-    NaN, and fingers in the order of its contacts.
+    NaN, and the `permutation` 0 to f - 1.
 
     Attributes:
         joints: actuated joints (b, h) [rad or m].

@@ -244,9 +244,9 @@ class GraspMixture(GaussianMixture):
         derivatives.
 
         Args:
-            code: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch axes,
-                such as (b, 6) of the `q` of a `ContactCode`, which may be given itself. A code that
-                is not finite gives NaN.
+            code: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch
+                axes. A `ContactCode` counts as its `q` (b, 6, 6), and the result is (b, 6). A code
+                that is not finite gives NaN.
 
         Raises `BadArgument` for codes that do not have six numbers.
         """
@@ -263,9 +263,9 @@ class GraspMixture(GaussianMixture):
         They may exceed the joint limits.
 
         Args:
-            code: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch axes,
-                such as (b, 6) of the `q` of a `ContactCode`, which may be given itself. A code that
-                is not finite gives NaN.
+            code: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch
+                axes. A `ContactCode` counts as its `q` (b, 6, 6), and the result is (b, 6, h). A
+                code that is not finite gives NaN.
 
         Raises `BadArgument` for codes that do not have six numbers.
         """

@@ -62,7 +62,8 @@ class ContactSpec(Value):
         table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means no
             table.
         tip_radius: radius [m] of the fingertips, balls that must stay above the table; 0 means
-            points. None means the radius of the hand's fingertips, but at least 12 mm (`TIP_RADIUS`).
+            points. None means the radius of the hand's fingertips, but at least 12 mm
+            (`TIP_RADIUS`).
         start_radius: radius, normalised, of the sphere on which initial guesses are drawn, around
             the centre of the shape's frame (Sec. 6.2).
         fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
