@@ -2,6 +2,7 @@
 rule.
 """
 
+import inspect
 import itertools
 import math
 
@@ -144,3 +145,7 @@ def test_bad_arguments():
     ]:
         with pytest.raises(BadArgument, match=match):
             call()
+
+
+def test_the_docstring_of_a_property_can_be_read_of_the_class():
+    assert "whitened form" in (inspect.getdoc(GaussianMixture.whitening) or "")

@@ -76,7 +76,7 @@ class CarriedWeight(Value):
     The acceleration of gravity is 9.81 m/s^2.
 
     Args:
-        mass: mass of the object [kg], or its `Distribution`.
+        mass: mass [kg] of the object, 0.001 to 10, or its `Distribution`.
         center: centre of mass (3,) [m] in the frame of the contacts, or (b, 3), one for each of b
             contact sets.
         press: mean of the normal forces [N] with which the fingers press at the contacts.

@@ -68,20 +68,22 @@ class ShapeLike(Protocol):
     @property
     def domain_radius(self) -> PerRow:
         """The radius, normalised, of the ball about the normalised origin in which the shape is
-        known.
+        known: a number, or (b,) as for `scale`.
         """
         ...
 
     @property
     def std_factor(self) -> PerRow:
-        """The factor (no unit) by which the posterior's standard deviations are multiplied."""
+        """The factor (no unit) by which the posterior's standard deviations are multiplied to give
+        those of the true surface: a number, or (b,) as for `scale`.
+        """
         ...
 
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance of the signed distance with derivatives, at q points `x` (q, 3).
 
-        Points and results are normalised. The fields of the `torchgrasp.shape.estimate.SurfaceJet`
-        are `distance` (q,), `gradient` (q, 3), `hessian` (q, 3, 3), `variance` (q,) and
+        Points and results are normalised. The fields of the `torchgrasp.shape.SurfaceJet` are
+        `distance` (q,), `gradient` (q, 3), `hessian` (q, 3, 3), `variance` (q,) and
         `variance_gradient` (q, 3).
         """
         ...

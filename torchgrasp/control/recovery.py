@@ -388,7 +388,10 @@ class Reopening:
 
 
 class LiftCheck:
-    """Check whether a closed hand that rises loses the object. Call it at each tick of the lift.
+    """Check whether a closed hand that rises loses the object.
+
+    Call it at the end of each tick of the lift, with three arguments; it returns `lost`. They are
+    an `Observation`, the height [m] to which the hand has risen, and the tick's length [s].
 
     `lost` becomes true, and stays so, at the first of two events (bounds: `LOST`):
 

@@ -211,7 +211,7 @@ class ClosingReference(Value):
         """The displacement (3,) [m] of the opened hand before it closes, which lifts all links out
         of the table.
 
-        The displacement is in the frame of the planned hand. It is 0 without a table, and if no
+        This cached property is in the frame of the planned hand. It is 0 without a table, and if no
         link is in the table. It is also 0 for a hand that would have to rise by more than 30 mm
         (`MOTION.most`), as in `ik.opened_pose`.
         """

@@ -190,8 +190,9 @@ class GraspTry:
         """Return an iterable of the `Targets` of each tick in which the lowered hand opens and
         withdraws.
 
-        The attribute `speed` [m/s] of the result is the rate at which `Targets.left` grows at the
-        last target that was drawn.
+        The hand withdraws as `Targets.left` grows from 0 to `length`, then waits as long. The
+        attribute `speed` [m/s] of the result is the rate of this growth at the last target that was
+        drawn.
 
         Args:
             observation: the last observation, which shows where the fingers begin.

@@ -72,8 +72,8 @@ class GraspProblem(Value):
             less certain, the pre-grasp opens farther.
         certificate: the certificate of force closure of each contact set, from `certify`.
         world: the surroundings of the hand, with one object for all contact sets, or one for each.
-        center: the object's centre (3,) [m], or one for each contact set (b, 3). Grasps near it
-            score higher.
+        center: the object's centre (3,) [m], or one for each contact set (b, 3). Grasps with the
+            contacts' centroid near it score higher.
         reachable: function of hand poses (k, 4, 4) [m] that returns a mask (k,) of the poses that
             an arm reaches; None means that every pose is reachable.
         descends: whether the opened hand may start above the pose of the grasp, where its opened
@@ -105,6 +105,8 @@ class GraspProblem(Value):
     def rows(self, index: Int[Tensor, "k"]) -> "GraspProblem":
         """Return the problem of some of the contact sets: those with the indices `index` (k,), in
         this order.
+
+        Raises `IndexError` for an index beyond the last set.
         """
         center = self.center if self.center.ndim == 1 else self.center[index]
         contacts = self.contacts[index]

@@ -37,6 +37,8 @@ class Obstacles(Value):
     """Regions of a scene that are probably occupied, as grids of distances; `Obstacles.of` makes
     them.
 
+    The grids are in the frame of the `Occupancy`, which must be that of the object.
+
     Attributes:
         field: signed distances [m] from the region that counts as occupied, negative inside.
         distances: distances (k, x, y, z) [m] at the nodes of `field`, one grid for each of the
@@ -130,8 +132,9 @@ class CollisionWorld(Value):
     does not exist.
 
     Args:
-        field: signed distances [m] from the object, negative inside, as `surface_field` makes them
-            of a shape. It holds one object for all hands of a batch, or one for each hand.
+        field: signed distances [m] from the object, negative inside. Of one object for all hands of
+            a batch it is a `SignedDistanceField`, as `surface_field` makes it. The planner also
+            uses a `torchgrasp.geometry.field_batch.FieldBatch`, of one object for each hand.
         table: the table's plane, or its height [m] along z.
         obstacles: other bodies of a scene.
 

@@ -293,7 +293,8 @@ def solve_joint(
     The guesses of a set are tried in their order. If the hand cannot reach the contacts, they slide
     along the surface of the `shape`, and are certified again. If the moved contacts fail, the grasp
     has the `Status` of the contact planner. Executable grasps come first, then those of higher
-    `score`.
+    `score`. This score is geometric, at most 0 and without unit. It is no log-odds, so the result's
+    `success` has no meaning.
 
     Args:
         problem: hand, b contact sets and surroundings.

@@ -60,7 +60,7 @@ class IKSolution(Batch):
     """The hand configurations that `solve_ik` found, one for each of b contact sets.
 
     h counts actuated joints, and f fingertips. A contact set for which nothing could be tried has
-    NaN.
+    NaN, and the `permutation` 0 to f - 1.
 
     Attributes:
         joints: actuated joints (b, h) [rad or m].
@@ -72,7 +72,8 @@ class IKSolution(Batch):
         clearance: least clearance (b,) [m] of the links from object, table, hard obstacles and each
             other; negative where they overlap.
         attempts: number (b,) of initial guesses that were refined.
-        status: `Status` (b,): `OK`, or the first tolerance that is exceeded.
+        status: `Status` code (b,): `OK`, or the first check that fails, such as `TIP_ERROR`. If
+            nothing was tried, it is `DEGENERATE` for contacts on a line, else `OUT_OF_REACH`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

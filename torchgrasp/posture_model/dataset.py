@@ -55,7 +55,7 @@ class SampleFolder:
 
     Iteration yields the chunks as `HandSamples`. By index the folder is a map-style dataset for
     `torch.utils.data.DataLoader`: `folder[i]` is (joints (h,) [rad or m], contact code (6,)) of
-    posture i.
+    posture i. The code has three lengths [m], then three cosines (`encode`).
 
     Attributes:
         folder: path of the folder.

@@ -32,7 +32,9 @@ class of_parameters(kept[Kept]):
     """
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
-        """Return the value of the property."""
+        """Return the value of the property, or the property itself if it is read of the class."""
+        if instance is None:
+            return self
         if any(getattr(instance, name).requires_grad for name in PARAMETERS):
             return self.func(instance)
         found = vars(instance).get(self.attrname)
@@ -220,6 +222,8 @@ class GaussianMixture(Value):
     @of_parameters
     def whitening(self) -> "Whitening":
         """The components in whitened form, which makes densities quick to evaluate.
+
+        This property is cached unless a parameter requires a gradient. Its value has three fields:
 
         * `matrix` (m, d, d) holds the lower-triangular W of each component, with W^T W =
           covariance^-1.

@@ -244,8 +244,9 @@ class GraspMixture(GaussianMixture):
         derivatives.
 
         Args:
-            code: a `ContactCode`, or codes (*b, 6): three lengths [m], then three cosines. b stands
-                for any batch axes. A code that is not finite gives NaN.
+            code: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch
+                axes. A `ContactCode` counts as its `q` (b, 6, 6), and the result is (b, 6). A code
+                that is not finite gives NaN.
 
         Raises `BadArgument` for codes that do not have six numbers.
         """
@@ -262,8 +263,9 @@ class GraspMixture(GaussianMixture):
         They may exceed the joint limits.
 
         Args:
-            code: a `ContactCode`, or codes (*b, 6): three lengths [m], then three cosines. b stands
-                for any batch axes. A code that is not finite gives NaN.
+            code: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch
+                axes. A `ContactCode` counts as its `q` (b, 6, 6), and the result is (b, 6, h). A
+                code that is not finite gives NaN.
 
         Raises `BadArgument` for codes that do not have six numbers.
         """

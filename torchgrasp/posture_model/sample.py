@@ -112,8 +112,9 @@ class HandSamples(Batch):
 
     Attributes:
         joints: positions (n, h) [rad or m] of the h actuated joints.
-        q: contact codes (n, q) of the fingertips: lengths [m], then cosines (`encode`). A hand of
-            three fingers has q = 6.
+        q: contact codes (n, q) of the f fingertips (`encode`). First come their f distances [m]
+            from the centroid, then the cosines between all pairs of normals. So q is 6 for three
+            fingers, 10 for four and 15 for five.
         joint_names: names of the h joints, in the order of the columns of `joints`.
         meta: texts that describe hand, seed and sampling.
 

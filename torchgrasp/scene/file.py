@@ -19,7 +19,8 @@ def read_scene(path: Path | str) -> Scene:
     """Read a scene from a .npz file, as `save_scene` writes it, with the checks of
     `Scene.from_depth`.
 
-    The file holds these arrays, of which only the first two are needed:
+    The file holds these arrays, of which `depth` and `intrinsics` are needed. Without
+    `camera_pose`, `labels` or `table` this argument of `Scene.from_depth` is None.
 
     * `depth` (h, w): floats in m, or whole numbers in mm.
     * `depth_unit`: metres of one count of the depth, if it is in another unit.
@@ -36,7 +37,8 @@ def read_scene(path: Path | str) -> Scene:
       If it is missing, it is True.
 
     Raises `CloudFileError` for no such file, or for malformed content. Raises `BadArgument` for a
-    `target` that is no label of an object, and the errors of `Scene.from_depth`.
+    `target` that is no label of an object, or a normal not of length 1. Raises the errors of
+    `Scene.from_depth`, too.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene

@@ -74,7 +74,8 @@ class Occupancy(Value):
     Something else is neither the target nor the table. The grid has x by y by z voxels.
 
     Attributes:
-        origin: centre (3,) [m] of voxel (0, 0, 0), in the scene's upright frame, where z is up.
+        origin: centre (3,) [m] of voxel (0, 0, 0), in the frame of the scene that
+            `estimate_occupancy` was given. Its z axis must point up (`Scene.to_upright`).
         spacing: distance [m] of neighbouring centres. Voxel (i, j, k) has its centre at `origin` +
             (i, j, k) * `spacing`.
         probability: probability (x, y, z) of each voxel, in [0, 1].

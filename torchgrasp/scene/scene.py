@@ -78,7 +78,8 @@ class Scene(Value):
         labels: label (n,) of each point: 1, 2, ... for the objects, 0 for the table and everything
             else.
         image: the camera's depth image. Its fields are `depth` (h, w) [m], 0 where nothing was
-            measured, `intrinsics` (3, 3) [pixels] and `obj_from_camera` (4, 4) [m].
+            measured, `intrinsics` (3, 3) [pixels] and `obj_from_camera` (4, 4) [m]. Its field
+            `bounded` is False if it was made of a cloud, and so has no true border.
         pixels: row and column (n, 2) of each point in the image.
         table: the plane that the objects stand on, or None if it is unknown.
         target: label of the object to be grasped, or None if none is chosen.
@@ -124,15 +125,15 @@ class Scene(Value):
         The objects are those of `labels`. Without labels they are the connected components above
         the table. Pixels on the table get the label 0, and so do flying pixels, which lie between
         a near and a far surface. A `mask` or a `point` chooses the target; without both there is
-        none.
+        none. Points, planes and directions are in the frame "obj", to which `camera_pose` leads.
 
         Args:
             depth: image (h, w) of depths, as `cloud_from_depth` takes it: floats in metres, or
                 integers in millimetres.
             intrinsics: matrix (3, 3) or (fx, fy, cx, cy) [pixels], or another form that
                 `cloud_from_depth` takes, without distortion.
-            camera_pose: rigid pose `obj_from_camera` (4, 4) [m]; None for results in the camera's
-                frame.
+            camera_pose: rigid pose `obj_from_camera` (4, 4) [m]; None means that "obj" is the
+                camera's frame (x right, y down, z forward).
             mask: image (h, w), not 0 at the target's pixels; its border may be a few pixels off.
                 Or any form of `labels` that marks one object.
             labels: the objects' pixels, in one of these forms:
@@ -208,14 +209,15 @@ class Scene(Value):
 
         The points are projected to a depth image of a pinhole camera at the cloud's viewpoint.
         Objects are found in it as in `from_depth`. A `mask`, a `box` or a `point` chooses the
-        target; without them there is none.
+        target; without them there is none. The frame of the cloud is "obj".
 
         Args:
             cloud: everything that the camera saw, n points [m], with the camera's viewpoint (3,).
             labels: whole numbers (n,), one for each point; 0 means no object.
             mask: mask (n,) of bool: the points of the target.
-            box: two opposite corners (2, 3) [m] of a box along the axes, which holds the target.
-            point: a place on the target, as a point (x, y, z) [m].
+            box: two opposite corners (2, 3) [m] of a box along the axes of the cloud's frame, which
+                holds the target.
+            point: a place on the target, as a point (x, y, z) [m] in the cloud's frame.
             table: a plane, or its height [m] along z; None means that it is fitted to the points.
             up: direction (3,) against gravity; the normal of a fitted table is within 30 degrees
                 of it. None allows any direction.
@@ -302,11 +304,12 @@ class Scene(Value):
 
         Args:
             target: a label of `things`; or a pixel (u, v) of the image, column first; or a point
-                (x, y, z) [m].
+                (x, y, z) [m] in the frame "obj".
 
-        The place is that of the nearest measured point. Raises `BadArgument` if that is farther
-        than 3 pixels (`SCENE.click`) or 10 mm (`SCENE.touch`), or on no object. Raises it for a
-        label that is not in `things`, too.
+        For a pixel or a point, the target is the object of the nearest measured point.
+
+        Raises `BadArgument` if that point is on no object, or farther than 3 pixels (`SCENE.click`)
+        or 10 mm (`SCENE.touch`). Raises it for a label that is not in `things`, too.
         """
         if isinstance(target, int) and not isinstance(target, bool):
             if target not in self.things:
@@ -341,8 +344,8 @@ class Scene(Value):
         The problems are:
 
         * Objects could also stand on another plane than `table`.
-        * Two objects touch, so that the border between them is a guess.
-        * An object has a crease: it may be several objects.
+        * Two objects touch, so that the border between them is a guess; not if both are `given`.
+        * An object that is not `given` has a crease: it may be several objects.
         * The target is cut off at the border of the image.
         * Another object hides much of the target.
         """
@@ -417,7 +420,8 @@ class Scene(Value):
     def noise(self) -> SensorNoise | None:
         """The noise of the camera's depths, estimated from the pixels that show the table.
 
-        None if no table is known, or if too few pixels show the table.
+        It is a `torchgrasp.cloud.SensorNoise`, whose fields `floor` [m], `growth` [1/m] and `bias`
+        [m] are estimated. None if no table is known, or if fewer than 1000 pixels show the table.
         """
         if self.table is None:
             return None

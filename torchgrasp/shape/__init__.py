@@ -6,18 +6,27 @@ from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.kernel import Kernel, matern52_kernel, rbf_kernel, thin_plate_kernel
 from torchgrasp.shape.surface import Surface, extract_surface, surface_field
 from torchgrasp.shape.second_view import NextView, next_view
-from torchgrasp.shape.estimate import JointEstimate, Normalisation, Observations, ShapeDerivatives
+from torchgrasp.shape.estimate import (
+    JointEstimate,
+    MeanJet,
+    Normalisation,
+    Observations,
+    ShapeDerivatives,
+    SurfaceJet,
+)
 
 __all__ = [
     "HollowShape",
     "JointEstimate",
     "Kernel",
+    "MeanJet",
     "NextView",
     "Normalisation",
     "Observations",
     "ShapeDerivatives",
     "SignedDistanceField",
     "Surface",
+    "SurfaceJet",
     "condition",
     "extract_surface",
     "matern52_kernel",

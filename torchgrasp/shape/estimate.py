@@ -80,6 +80,8 @@ class Observations(Batch):
         normal_noise: standard deviation (n,) of each component of a unit normal (no unit); any
             finite numbers where `has_normal` is False.
 
+    Raises `BadArgument` for tensors of shapes that do not fit together.
+
     >>> x, some = torch.eye(3), torch.ones(3)
     >>> len(Observations(x, 0 * some, x, some > 0, 0.01 * some, 0.05 * some).rows()[0])
     12
@@ -190,12 +192,19 @@ class MeanJet(Batch):
 class SurfaceJet(MeanJet):
     """The mean signed distance with two derivatives, and its variance with one, from `ShapeGP.jet`.
 
+    Derivatives are by normalised coordinates. b stands for the batch axes of the points.
+
     Attributes:
         distance: mean signed distance (*b,), normalised.
         gradient: gradient (*b, 3) of the mean (no unit).
         hessian: second derivatives (*b, 3, 3) of the mean, per normalised unit.
         variance: variance (*b,) of the signed distance, in squared normalised units.
         variance_gradient: gradient (*b, 3) of the variance, in normalised units.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> shape = fit_shape(load_object("jug").view)
+    >>> shape.jet(shape.x[:2]).hessian.shape
+    torch.Size([2, 3, 3])
     """
 
     variance: Float[Tensor, "*b"]

@@ -98,9 +98,9 @@ def fit_shape(
         cloud: points [m] of one object from one view or several (`merge_clouds`), or another value
             that `plan_grasps` takes. Points from all sides need outward `normals`, or the
             `viewpoint` of each point.
-        noise: standard deviation of an observed signed distance, normalised: one unit is the
-            shape's `scale`, about the object's radius. If `support` is "paper", also that of a
-            component of a normal.
+        noise: standard deviation of an observed signed distance, at most 1. It is normalised: one
+            unit is the shape's `scale` [m], about the object's radius. If `support` is "paper",
+            also that of a component of a normal.
         budget: number of observed points, 25 to 1000 (`SHAPE.budget`). Up to 20 of them lie on a
             sphere around the object, and one in its centre if that is inside. The others are the
             most informative points of the cloud. The outline and the hidden side come in addition.

@@ -110,11 +110,12 @@ class ShapeGP(Posterior, Normalisation):
         psi: Positive,
         std_factor: Positive = 1.0,
     ) -> "ShapeGP":
-        """Return the shape with the observations of `posterior` in the normalised frame `frame`.
+        """Return the shape with the observations of `posterior`, whose normalised frame is `frame`.
 
-        Use `condition` to make a shape of observations. The domain's radius is the smaller of two
-        lengths. One is half the kernel's `diameter`. The other is 1.25 (`DOMAIN.reach`) times the
-        greatest distance of an observed point from the centre.
+        Nothing is transformed or computed anew; `condition` makes a shape of observations. The
+        domain's radius is the smaller of two lengths. One is half the kernel's `diameter`. The
+        other is 1.25 (`DOMAIN.reach`) times the greatest distance of an observed point from the
+        centre.
 
         Args:
             posterior: another shape, of which the fields `x`, `has_normal`, `weights`, `factor`,
@@ -169,7 +170,8 @@ class ShapeGP(Posterior, Normalisation):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Bool[Tensor, "*b"]:
-        """Return a mask (*b,) of the points (*b, 3) [m] that lie in the domain.
+        """Return a mask (*b,) of the points (*b, 3) [m], in the cloud's frame, that are in the
+        domain.
 
         The domain is the ball in which the posterior is valid: `domain_radius` around `center`. b
         stands for any batch axes.

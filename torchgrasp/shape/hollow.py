@@ -58,8 +58,8 @@ class HollowShape(ShapeGP):
     At each point one surface applies: the surface with the greater mean signed distance. Distance,
     normal and covariance are those of this surface. The errors of the two surfaces are independent.
 
-    The attributes of `ShapeGP` describe the outer surface. But `cloud` holds the points of both,
-    and `domain_radius` is the smaller one.
+    The attributes of `ShapeGP` describe the outer surface. But `cloud` holds the points of both
+    surfaces, and `domain_radius` is the smaller of their two radii.
 
     Attributes:
         inner: the inner surface; its signed distance is positive in the cavity and negative around
@@ -84,7 +84,7 @@ class HollowShape(ShapeGP):
         Args:
             outer: the outer surface; its signed distance is positive outside.
             inner: the inner surface; its signed distance is positive in the cavity.
-            cloud: the seen points [m] of both surfaces.
+            cloud: the seen points [m] of both surfaces, in the frame of `center`.
         """
         fields = common_fields(outer, ShapeGP)
         fields["cloud"] = cloud
@@ -159,8 +159,9 @@ class HollowShape(ShapeGP):
         """Return mean and variance of the signed distance with derivatives, at q points `x` (q, 3).
 
         The points are those that `normalise` returned. The mean has first and second derivatives,
-        the variance the first. All are by normalised coordinates: `distance` (q,), `gradient`
-        (q, 3), `hessian` (q, 3, 3), `variance` (q,), `variance_gradient` (q, 3).
+        the variance the first. All are normalised: one unit is `scale` [m]. The fields of the
+        `SurfaceJet` are `distance` (q,), `gradient` (q, 3), `hessian` (q, 3, 3), `variance` (q,)
+        and `variance_gradient` (q, 3).
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.jet(own))
         return map_tensors(merge, *parts)
@@ -170,8 +171,9 @@ class HollowShape(ShapeGP):
         """Return the mean signed distance with first and second derivatives, at q points `x`
         (q, 3).
 
-        The points are those that `normalise` returned. All are by normalised coordinates:
-        `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3, 3).
+        The points are those that `normalise` returned. The result is normalised: one unit is
+        `scale` [m]. The fields of the `MeanJet` are `distance` (q,), `gradient` (q, 3) and
+        `hessian` (q, 3, 3).
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.mean_jet(own))
         return map_tensors(merge, *parts)
@@ -202,7 +204,8 @@ class HollowShape(ShapeGP):
         """Return the vessel given further observations in its normalised frame.
 
         Each observation changes the surface, outer or inner, that applies at its point
-        (`wall_at`). Its distance and normal are those from that surface.
+        (`wall_at`). Its distance and normal are those from that surface. Raises
+        `IndefiniteCovariance` for observations too far outside the domain.
         """
         outer, inner = self.wall_at(new.x).T
         new_outer = self.outer.append(new[outer])

@@ -184,8 +184,9 @@ class Posterior(Value):
         """Return mean and variance of the signed distance with derivatives, at q points `x` (q, 3).
 
         The points are those that `normalise` returned. The mean has first and second derivatives,
-        the variance the first. All are by normalised coordinates: `distance` (q,), `gradient`
-        (q, 3), `hessian` (q, 3, 3), `variance` (q,), `variance_gradient` (q, 3).
+        the variance the first. All are normalised: one unit is `scale` [m]. The fields of the
+        `SurfaceJet` are `distance` (q,), `gradient` (q, 3), `hessian` (q, 3, 3), `variance` (q,)
+        and `variance_gradient` (q, 3).
         """
         # The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2).
         # Here a_j is the weight of the distance at the observed point x_j, b_j that of its normal.
@@ -202,8 +203,9 @@ class Posterior(Value):
         """Return the mean signed distance with first and second derivatives, at q points `x`
         (q, 3).
 
-        The points are those that `normalise` returned. All are by normalised coordinates:
-        `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3, 3). The call costs less than `jet`.
+        The points are those that `normalise` returned. The result is normalised: one unit is
+        `scale` [m]. The fields of the `MeanJet` are `distance` (q,), `gradient` (q, 3) and
+        `hessian` (q, 3, 3). The call costs less than `jet`.
         """
         size = at_once(x, CHUNK.jet)
         if not self._is_plain(x):

@@ -47,8 +47,8 @@ class Cost(NamedTuple):
 
     Attributes:
         cause: name of the cause:
-            "load": the forces that carry the load.
-            "moved": the contacts, if the object is not quite where the camera saw it.
+            "load": large forces that are needed to carry the load.
+            "moved": contacts that carry less if the object is not where the camera saw it.
             "surface": the uncertainty of the surface at the contacts.
             "object": the size of the object.
             "task": mass, friction and force of the task.
@@ -73,8 +73,8 @@ def explain_success(
     log-odds rise if these features take their median over grasps that held. Causes that do not
     lower the success are left out.
 
-    No trial may have tested some of the frictions and masses of the task. Then "task" is always
-    among the causes, and its sentence says for what share of them success is unknown.
+    If no trial has tested some of the task's frictions and masses, "task" is always among the
+    causes. Its sentence then says for what share of them the success is unknown.
 
     Args:
         grasps: grasps of `plan_grasps`, of which the first counts.

@@ -27,7 +27,7 @@ class GraspTask(Value):
     """What a grasp must do. The predicted success is the success in this task.
 
     Args:
-        mass: mass [kg] of the object, or its `Distribution`.
+        mass: mass [kg] of the object, 0.001 to 10, or its `Distribution`.
         force: normal force [N] of the strongest finger. None means 4 N in pulls. In a lift it means
             as much as the felt load needs.
         lift: True means that the object is lifted off its table. False means pulls: the object

@@ -97,7 +97,8 @@ class Disturbance(Value):
 class ClosingTrace(Value):
     """True contacts of f fingertips, and estimates of the controller, at t control ticks.
 
-    It is the field `trace` of a `ClosureResult`. Vectors are in the hand's frame.
+    It is the field `trace` of a `ClosureResult`. Points and vectors are in the frame of the hand's
+    root link, which moves with the hand.
 
     Attributes:
         forces: contact forces (t, f, 3) [N] on the object, with friction; 0 without contact.
@@ -137,8 +138,9 @@ class ClosureResult(Value):
         status: `OK`, or the reason why the object was not held.
         time: times (t,) [s] at which the control ticks ended.
         forces: normal force (t, f) [N] of each fingertip; 0 without contact.
-        object_pose: pose (t, 4, 4) of the object in the frame of the grasp.
-        hand_pose: pose (t, 4, 4) of the hand in the frame of the grasp.
+        object_pose: transform (t, 4, 4) in the frame of the grasp. It moves the mesh that
+            `close_hand` was given to the object's place at the tick.
+        hand_pose: pose (t, 4, 4) of the hand's root link in the frame of the grasp.
         joints: positions (t, j) [rad or m] of all joints, in the order of `joint_names`.
         targets: positions (t, j) [rad or m] that were the targets of the drives in the tick.
         joint_names: names of all joints of the URDF.
@@ -278,7 +280,8 @@ class SensorModel(Value):
             tactile normal force, and 0.01 N m of a joint torque.
         dead: names of the fingers whose sensor is known to be broken.
 
-    Raises `BadArgument` for a number outside its range, or an unknown kind.
+    Raises `BadArgument` for a number outside its range, or an unknown kind. An unknown finger
+    raises it only where the model meets a hand, as in `close_hand`.
 
     >>> SensorModel("binary").full
     False

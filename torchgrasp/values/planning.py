@@ -285,8 +285,9 @@ class ContactCode(Value):
     Attributes:
         q: code (b, 6, 6) of each set in each assignment: first 3 distances [m] of the contacts from
             their centroid, then 3 cosines between their normals.
-        obj_from_vf: pose (b, 6, 4, 4) [m] of the virtual frame that the contacts define, in the
-            frame of the contacts.
+        obj_from_vf: pose (b, 6, 4, 4) [m] of the virtual frame (Eqs. 15-17) in the frame of the
+            contacts. Its origin is their centroid. x points from the contact of the first finger to
+            that of the third. z is normal to the plane of the contacts.
         status: `Status` code (b,) of each set. If the contacts of a set lie on a line or in a
             point, it is not `OK`, and `q` and `obj_from_vf` are NaN.
         permutation: indices (6, 3): in assignment k finger i touches contact `permutation[k, i]`.
@@ -354,8 +355,8 @@ class Grasps(Batch):
     first.
 
     `plan_grasps` returns them, and `load_grasps` reads them from a file. g counts grasps, f
-    fingertips, h actuated joints of the hand, and n joints of the arm. Positions are in the frame
-    of the cloud. Joints that slide have [m] in place of [rad].
+    fingertips, h actuated joints of the hand, and n joints of the arm. Positions and directions are
+    in the frame of the cloud. Joints that slide have [m] in place of [rad].
 
     Attributes:
         joints: actuated joints (g, h) [rad or m], in the order of `hand.joint_names`.
@@ -373,8 +374,9 @@ class Grasps(Batch):
         normal_angle: angle (g, f) [rad] between the axis of a fingertip's pad and the inward normal
             of the object at its contact.
         certificate: proof of force closure (g rows).
-        score: log-odds (g,) of the predicted success, by which executable grasps are ordered. The
-            score of failed grasps is another number, which says nothing of success.
+        score: log-odds (g,) of the predicted success. Executable grasps are in its order, unless
+            the argument `ranking` of `plan_grasps` is "variance". The score of failed grasps is
+            another number, which says nothing of success.
         status: `Status` code (g,): `OK` for an executable grasp, else the reason why it failed.
         meta: names, units, hashes and the seed of the plan, as text.
         known: mask (g,) of the grasps like those of the trials to which the success model was
@@ -417,9 +419,10 @@ class Grasps(Batch):
 
     @property
     def success(self) -> Float[Tensor, "g"]:
-        """The predicted probability (g,) that each planned grasp holds.
+        """The predicted probability (g,) that each planned grasp holds the object in its task, the
+        argument `task` of `plan_grasps`.
 
-        It is 0 for a grasp that cannot be executed, and NaN if it is unknown. The success of a
+        It is 0 for a grasp that cannot be executed, and NaN if it is not `known`. The success of a
         single grasp formats as a number: `f"{grasps.best.success:.0%}"`.
         """
         likely = torch.sigmoid(self.score)

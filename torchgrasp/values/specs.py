@@ -44,7 +44,7 @@ class ContactSpec(Value):
     are the paper's: one unit is `ShapeGP.scale` metres.
 
     Args:
-        friction: coefficient of friction between fingertip and object at execution, or its
+        friction: coefficient of friction between fingertip and object at execution, 0 to 10, or its
             `Distribution`.
         edges: number of edges of the linearised friction cone, at least 3.
         max_variance: largest variance of the signed distance at a contact, S_thresh of Eq. (12), in
@@ -57,11 +57,13 @@ class ContactSpec(Value):
         flatness: largest angle [rad] between the normals at a contact and on a ring around it. None
             means that flatness is not checked.
         flat_radius: radius [m] of the ring. None means the largest of 8, 6, 4 and 3 mm
-            (`FLAT_RADII`) that the object allows.
+            (`FLAT_RADII`) that the object allows. `plan_grasps` then goes down to 1 mm (`RIM`) for
+            an object on a table without grasps.
         table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means no
             table.
-        tip_radius: radius [m] of the fingertips, which may rest on the table; 0 means points. None
-            means the radius of the hand's fingertips, but at least 12 mm (`TIP_RADIUS`).
+        tip_radius: radius [m] of the fingertips, balls that must stay above the table; 0 means
+            points. None means the radius of the hand's fingertips, but at least 12 mm
+            (`TIP_RADIUS`).
         start_radius: radius, normalised, of the sphere on which initial guesses are drawn, around
             the centre of the shape's frame (Sec. 6.2).
         fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
@@ -303,7 +305,8 @@ class TrialSpec(Value):
             "uncertainty": Eqs. 25-28 with the surface's calibrated standard deviations, and with
               `options`.
             "fixed": the same with equal gains for all contacts.
-            "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
+            "paper": Eqs. 25-28 as written, with forces of a learned stability model, or analytic
+              ones if the hand's folder has no stability.safetensors.
             "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
             "position": PI control to goals behind the contacts.
             "open_loop": joint motion from pre-grasp to grasp to squeeze.
@@ -315,9 +318,10 @@ class TrialSpec(Value):
             "law": Eq. 25 continues.
             None means "grip", or "force" in three cases: `force` is given, the closing is not
               "uncertainty" or "fixed", or a fingertip has no working tactile sensor.
-        mass: mass [kg] of the object. From a `Distribution` each trial draws it by its seed.
-        friction: coefficient of friction of every contact. From a `Distribution` each trial draws
-            it by its seed.
+        mass: mass [kg] of the object, 0.001 to 10. From a `Distribution` each trial draws it by its
+            seed.
+        friction: coefficient of friction of every contact, 0 to 10. From a `Distribution` each
+            trial draws it by its seed.
         gravity: acceleration by gravity [m/s^2].
         approach: length [m] of the straight path to the pre-grasp; 0 means that the hand starts
             there.
