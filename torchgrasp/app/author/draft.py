@@ -82,8 +82,10 @@ class Draft(NamedTuple):
         urdf: text of the repaired URDF, which the hand.toml names. It is "" if nothing had to be
             repaired; the hand.toml then names the published URDF.
         repairs: a sentence for each repair of the URDF.
-        warnings: a sentence for each number of the URDF that is implausible for a hand, and for
-            each guess that is likely wrong. `toml` repeats them as comments.
+        warnings: sentences on what is implausible or likely wrong, such as: numbers of the URDF,
+            very thin fingertips, links with a <visual> but no <collision>, pairs of links that are
+            no longer tested for collision, and parts of an MJCF that are left out. `toml` repeats
+            them as comments.
         meshes: bytes of each visual mesh file that `urdf` names, by its path relative to the URDF.
             Only pictures use them.
     """
@@ -178,8 +180,8 @@ def new_hand(
         file: name of the file in which the user saves the repaired URDF; the hand.toml names it.
 
     Raises:
-        HandFileError: a file or a mesh that is missing, malformed or refused; no collision shape;
-            or a fault that cannot be repaired.
+        HandFileError: a file or a mesh that is missing, malformed, too large or outside its folder;
+            no collision shape; or a fault that cannot be repaired.
         BadArgument: an unknown root; fewer than three tips or more than five; a tip without a
             collision shape or a movable joint; or a bad length or radius of a sensor.
         MissingExtra: an MJCF without MuJoCo.
@@ -400,8 +402,8 @@ def clean_arm(path: Path | str, meshes: Path | str | None = None) -> str:
         path: the published URDF of the arm.
         meshes: folder in which all mesh files lie; None means the folder of the URDF.
 
-    Raises `HandFileError` for a URDF or a mesh that is missing, malformed or refused, and for a
-    sliding joint without limits.
+    Raises `HandFileError` for a URDF or a mesh that is missing, malformed, too large or outside its
+    folder. It is also raised for a sliding joint without limits.
 
     >>> from torchgrasp import load_hand
     >>> clean_arm(load_hand("barrett").urdf_path).splitlines()[0]
