@@ -195,8 +195,14 @@ class Explanation(Value):
     Attributes:
         starts: number of initial guesses from which grasps were planned, without a change and with
             each.
-        funnel: how many candidates each planning stage lost, and why, without a change.
-        trials: the result of planning with each change, the most helpful first.
+        funnel: how many candidates each planning stage lost, and why, without a change. Its field
+            `stages` holds "contacts", "postures" and "grasps", in this order. Each has a name
+            `stage`, the number `given` of `things`, the number `kept`, and a dict `lost` of the
+            numbers lost for each `Status`.
+        trials: the result of planning with each change, the most helpful first. Each has `words`
+            for the change, and says whether it is the user's `choice`. `executable` is the number
+            of grasps, `expected` their mean predicted success as in `best`, and `funnel` the
+            losses.
         left: number of further changes that were not tried, to bound the work.
 
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
