@@ -105,7 +105,7 @@ class Wish(NamedTuple):
             means the last link of each branch.
         name: name of the hand; "" means the robot's name in the URDF.
         root: name of the hand's first link, if the URDF also has an arm. Links that are not below
-            it are left out.
+            it are left out. "" means the root link; in an MJCF, the body whose links have motors.
         meshes: folder in which all mesh files lie; None means the folder of the URDF.
         visual: whether links without <collision> take their <visual> as collision shapes.
         tip_offset: lengths [m] by which tactile sensors extend the fingertips. () means no sensors.
