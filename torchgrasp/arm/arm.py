@@ -60,7 +60,7 @@ class Arm(Value):
     float64 on the CPU.
 
     Attributes:
-        urdf: the chain of links from base to tip.
+        urdf: the parsed chain from base to tip, with tuples of its `links` and `joints`.
         tree: forward kinematics of this chain.
         lower: lower limits (n,) of the joints [rad or m].
         upper: upper limits (n,) of the joints [rad or m].

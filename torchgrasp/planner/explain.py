@@ -199,9 +199,9 @@ class Explanation(Value):
             `stages` holds "contacts", "postures" and "grasps", in this order. Each has a name
             `stage`, the number `given` of `things`, the number `kept`, and a dict `lost` of the
             numbers lost for each `Status`.
-        trials: the result of planning with each change, the most helpful first. Each has `words`
-            for the change, and says whether it is the user's `choice`. `executable` is the number
-            of grasps, `expected` their mean predicted success as in `best`, and `funnel` the
+        trials: the result of planning with each change, the most helpful first. Its `words`
+            describe the change, and `choice` is whether the user can make it. `executable` is the
+            number of grasps, `expected` their mean predicted success as in `best`, and `funnel` the
             losses.
         left: number of further changes that were not tried, to bound the work.
 

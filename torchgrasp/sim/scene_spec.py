@@ -149,7 +149,7 @@ class SceneSpec:
 
     @functools.cached_property
     def urdf(self) -> Urdf:
-        """The parsed URDF of the hand.
+        """The parsed URDF of the hand, with tuples of its `links` and `joints` in the file's order.
 
         Raises `HandFileError` if the file is not valid.
         """
@@ -230,8 +230,10 @@ WRIST_JOINT = "torchgrasp_wrist"  # name of the fixed joint between mount and ha
 class Slide(NamedTuple):
     """A driven prismatic joint of the mount that carries a simulated hand (`SceneSpec.mount`).
 
-    Args:
-        name: name of the joint.
+    Attributes:
+        name: name of the joint. "torchgrasp_lift" is what `SimulatedScene.lift` moves, and
+            "torchgrasp_approach" what `approach` moves. "torchgrasp_shift_x", "torchgrasp_shift_y"
+            and "torchgrasp_shift_z" are what `shift` moves.
         axis: unit vector (x, y, z) of the motion in the world's frame.
         lower: least position [m] along the axis.
         upper: greatest position [m] along the axis.
