@@ -82,10 +82,9 @@ class Draft(NamedTuple):
         urdf: text of the repaired URDF, which the hand.toml names. It is "" if nothing had to be
             repaired; the hand.toml then names the published URDF.
         repairs: a sentence for each repair of the URDF.
-        warnings: sentences on what is implausible or likely wrong, such as: numbers of the URDF,
-            very thin fingertips, links with a <visual> but no <collision>, pairs of links that are
-            no longer tested for collision, and parts of an MJCF that are left out. `toml` repeats
-            them as comments.
+        warnings: sentences on implausible numbers of the URDF and guesses that are likely wrong.
+            They also name links without <collision>, pairs of links that often collide, and what
+            of an MJCF is left out. `toml` repeats them as comments.
         meshes: bytes of each visual mesh file that `urdf` names, by its path relative to the URDF.
             Only pictures use them.
     """
@@ -180,8 +179,8 @@ def new_hand(
         file: name of the file in which the user saves the repaired URDF; the hand.toml names it.
 
     Raises:
-        HandFileError: a file or a mesh that is missing, malformed, too large or outside its folder;
-            no collision shape; or a fault that cannot be repaired.
+        HandFileError: a file or a mesh that is missing, malformed, too large or outside its folder.
+        HandFileError: no collision shape, or a fault that cannot be repaired.
         BadArgument: an unknown root; fewer than three tips or more than five; a tip without a
             collision shape or a movable joint; or a bad length or radius of a sensor.
         MissingExtra: an MJCF without MuJoCo.

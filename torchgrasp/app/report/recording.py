@@ -59,6 +59,7 @@ def write_recording(path: Path | str, run: Run) -> Path:
     Raises:
         MissingExtra: Rerun (extra `rerun`) is not installed.
         BadArgument: the run has a closing, and its executable grasps do not touch its mesh.
+        BadArgument: the table of the run is above most points of its cloud.
         OutputError: the file cannot be written.
 
     >>> write_recording("run.rrd", run)  # doctest: +SKIP

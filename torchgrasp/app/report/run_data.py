@@ -106,8 +106,8 @@ class Run:
         z points to the camera. Without both, it points where the points spread least. `spec` is not
         transformed: its table stays in the frame of the old cloud.
 
-        Raises `BadArgument` if the executable grasps do not touch the mesh, or if the table is
-        above most points of the cloud.
+        Raises `BadArgument` if the executable grasps do not touch the mesh. It is also raised if
+        the table is above most points of the cloud.
         """
         obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
         upright_from_obj = inverse(obj_from_upright)
