@@ -133,8 +133,8 @@ class Arm(Value):
     def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> TipPoses:
         """Return the poses (3, 4, k) [m] of the tip at which the hand has k given poses.
 
-        They are in the frame of the arm's root link, without the last row (0, 0, 0, 1) of the 4 x 4
-        matrices. The joints that reach them are not computed.
+        They are in the frame of the arm's root link. The last row (0, 0, 0, 1) of each matrix is
+        left out. The joints that reach them are not computed.
 
         Args:
             obj_from_hand: poses (k, 4, 4) [m] of the hand's root link in the object's frame.
@@ -148,9 +148,9 @@ class Arm(Value):
         """Return (poses, motion): the tip's pose and its Jacobian in k postures.
 
         Both are in the frame of the arm's root link. `poses` (3, 4, k) [m] are without the last row
-        (0, 0, 0, 1) of the 4 x 4 matrices. `motion` (6, n, k) is the derivative by each of the n
-        joints [mm per rad or m]. Its rows 0 to 2 are that of the position. Rows 3 to 5 are that of
-        the rotation vector, times a hand's depth of 100 mm (`LEVER`), so that they are in mm, too.
+        (0, 0, 0, 1) of each matrix. `motion` (6, n, k) is the derivative by each of the n joints
+        [mm per rad or m]. Its rows 0 to 2 are that of the position. Rows 3 to 5 are that of the
+        rotation vector, times a hand's depth of 100 mm (`LEVER`). So they are in mm, too.
 
         Args:
             joints: positions (n, k) of the arm's joints [rad, or m for sliding joints].
