@@ -68,8 +68,8 @@ class CloudFile(Value):
     Attributes:
         cloud: the points [m], in float64.
         notes: a sentence for each kind of data in the file that was left out.
-        table: plane of the table in the frame of the cloud, if the file holds one, as `save_cloud`
-            writes it; else None.
+        table: plane of the table in the frame of the cloud, as `save_cloud` writes it. None if the
+            file holds none.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp(), "cloud.npy")

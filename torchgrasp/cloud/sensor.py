@@ -100,7 +100,7 @@ class SensorNoise(Value):
         disparity: standard deviation of the disparity [px]; only with a `base`.
         step: resolution of the disparity [px], to which it is rounded; 0 means no rounding. Only
             with a `base`.
-        floor: the part of the depth's standard deviation [m] that is the same at any depth;
+        floor: the part of the depth's standard deviation [m] that is the same at any depth.
             `partial_view` draws it only without a `base`.
         growth: the other part [1/m], which is multiplied by the squared depth; only without a
             `base`. The squares of both parts add up (`sigma`).
