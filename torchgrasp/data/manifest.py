@@ -272,8 +272,8 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
             writes.
         camera: whether the cloud has a `viewpoint`.
 
-    Raises `DatasetError` if there is no manifest, if it has no valid entry of the object, or for an
-    unknown view. Raises `CloudFileError` for a missing or malformed file of the cloud.
+    Raises `DatasetError` if there is no manifest, or if it has no valid entry of the object or the
+    view. Raises `CloudFileError` for a missing or malformed file of the cloud.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())

@@ -33,9 +33,9 @@ class JobRow(NamedTuple):
     Attributes:
         object: name of the object.
         view: name of the view; "" if the object could not be read, or has no view.
-        status: `OK` if a grasp is executable. Else it is the most frequent failure of the plan,
-            `BAD_OBJECT` for bad files or a failed plan, or how the work on the job ended:
-            `TIMED_OUT`, `WORKER_DIED` or `BROKEN`.
+        status: `OK` if a grasp is executable. Else it is the most frequent failure of the plan, or
+            `BAD_OBJECT` for bad files or a failed plan. It is `TIMED_OUT`, `WORKER_DIED` or
+            `BROKEN` if the work on the job did not end.
         note: details of the status, or "".
         family: name of a family of similar objects, or "".
         group: group of objects, such as "solid", or "".
