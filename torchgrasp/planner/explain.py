@@ -196,9 +196,9 @@ class Explanation(Value):
         starts: number of initial guesses from which grasps were planned, without a change and with
             each.
         funnel: how many candidates each planning stage lost, and why, without a change. Its field
-            `stages` holds "contacts", "postures" and "grasps", in this order. Each has a name
-            `stage`, the number `given` of `things`, the number `kept`, and a dict `lost` of the
-            numbers lost for each `Status`.
+            `stages` holds "contacts", "postures" and "grasps", in this order. Each has its
+            name `stage`, and the numbers `given` and `kept` of its `things`. The dict `lost` has
+            the number lost for each `Status`.
         trials: the result of planning with each change, the most helpful first. Its `words`
             describe the change, and `choice` is whether the user can make it. `executable` is the
             number of grasps, `expected` their mean predicted success as in `best`, and `funnel` the
