@@ -36,8 +36,8 @@ class StepContacts:
         finger: mask (f,) of the fingers that touch the object, with the fingertip or with the link
             that carries it.
         force: force (f, 3) [N] of each fingertip on the object, with friction.
-        stray: sums (3,) [N s] of the sizes of other normal impulses. They are of the hand on
-            neighbours, of the hand on the table, and of other links of the hand on the object.
+        stray: sums (3,) [N s] of the sizes of other normal impulses: of the hand on neighbours, of
+            the hand on the table, and of other links on the object.
     """
 
     impulse: np.ndarray
