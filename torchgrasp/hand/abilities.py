@@ -47,8 +47,8 @@ class FingerAbility:
         force: greatest normal force [N] of the tip, the median over the free postures. NaN if in
             half of them no joint moves the contact point along its normal: then the structure
             carries the load.
-        sure_force: greatest normal force [N] that is reached in 90 % of the free postures. NaN as
-            for `force`.
+        sure_force: normal force [N] that the tip reaches in 90 % of the free postures. NaN if in
+            these no joint moves the contact point along its normal.
 
     Both forces act at the contact point of the pad, along the pad's normal. No other finger
     presses, and each actuated joint exerts at most its effort. A posture is free if no links of the
