@@ -60,7 +60,7 @@ class Arm(Value):
     float64 on the CPU.
 
     Attributes:
-        urdf: the chain of links from base to tip.
+        urdf: the parsed chain from base to tip, with tuples of its `links` and `joints`.
         tree: forward kinematics of this chain.
         lower: lower limits (n,) of the joints [rad or m].
         upper: upper limits (n,) of the joints [rad or m].
@@ -120,8 +120,9 @@ class Arm(Value):
 
     @checked
     def hand_poses(self, joints: Float[Tensor, "k n"]) -> Float[Tensor, "k 4 4"]:
-        """Return the pose `obj_from_hand` (k, 4, 4) [m] of the hand's root link in each of k
-        postures.
+        """Return the poses `obj_from_hand` (k, 4, 4) [m] of the hand's root link in k postures.
+
+        They are in the object's frame, that of `obj_from_base`.
 
         Args:
             joints: positions (k, n) of the arm's joints [rad, or m for sliding joints].
@@ -132,8 +133,8 @@ class Arm(Value):
     def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> TipPoses:
         """Return the poses (3, 4, k) [m] of the tip at which the hand has k given poses.
 
-        They are in the frame of the base, without the last row (0, 0, 0, 1). The joints that reach
-        them are not computed.
+        They are in the frame of the arm's root link. The last row (0, 0, 0, 1) of each matrix is
+        left out. The joints that reach them are not computed.
 
         Args:
             obj_from_hand: poses (k, 4, 4) [m] of the hand's root link in the object's frame.
@@ -144,13 +145,12 @@ class Arm(Value):
 
     @checked
     def tip_motion(self, joints: Float[Tensor, "n k"]) -> tuple[TipPoses, Float[Tensor, "6 n k"]]:
-        """Return (poses, motion): the tip's pose and its Jacobian in k postures, in the base's
-        frame.
+        """Return (poses, motion): the tip's pose and its Jacobian in k postures.
 
-        `poses` (3, 4, k) [m] are without the last row (0, 0, 0, 1). `motion` (6, n, k) is the
-        derivative by each of the n joints. Its rows 0 to 2 are that of the position [mm per rad or
-        m]. Rows 3 to 5 are that of the rotation vector [rad per rad or m], times a hand's depth of
-        100 mm (`LEVER`). So all rows are in mm.
+        Both are in the frame of the arm's root link. `poses` (3, 4, k) [m] are without the last row
+        (0, 0, 0, 1) of each matrix. `motion` (6, n, k) is the derivative by each of the n joints
+        [mm per rad or m]. Its rows 0 to 2 are that of the position. Rows 3 to 5 are that of the
+        rotation vector, times a hand's depth of 100 mm (`LEVER`). So they are in mm, too.
 
         Args:
             joints: positions (n, k) of the arm's joints [rad, or m for sliding joints].

@@ -43,7 +43,8 @@ class CampaignSpec(Value):
 
     Args:
         protocol: the protocol by which each grasp is tried in simulation, or its name in
-            `torchgrasp.evaluation.PROTOCOLS`.
+            `torchgrasp.evaluation.PROTOCOLS`. An unknown name raises `BadArgument` in `test` and in
+            `run_campaign`, not here.
         trials: which views are planned on, and how many of their grasps are tried.
         licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
         jobs_in_shard: number of jobs in one file. A job is one view of one object.

@@ -117,7 +117,7 @@ def partial_view(
         seed: seed of the noise and of the choice of points.
 
     Raises:
-        BadArgument: `n` is below 4, or the pose is not rigid.
+        BadArgument: `n` is below 4, the camera's name is unknown, or the pose is not rigid.
         MeshError: a mesh without faces.
         TooFewPoints: the camera sees fewer than 4 points of the mesh.
         SuspiciousScale: the points extend over less than 5 mm or more than 2 m.

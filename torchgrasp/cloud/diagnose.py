@@ -115,8 +115,8 @@ def diagnose_cloud(
 
     Args:
         cloud: the points [m].
-        up: vector (3,) of any length that points up. None means z, unless the cloud seems to be in
-            its camera's frame.
+        up: vector (3,) of any length that points up. None means z. If z then points forward, as
+            in a camera's frame, the advice asks for another `up`.
         table: the plane under the object; None means a level plane at the lowest point.
         stands: whether the object stands on a table. False means an object in the air, whose camera
             may be below it.

@@ -109,11 +109,12 @@ def cut_object(
 
     Args:
         cloud: points [m] of a scene.
-        up: unit vector (3,) that points up.
-        point: place (3,) [m] on or near the object. Points more than 0.5 m away (`PARTS.around`)
-            are left out first. None means the object with the most points above the plane.
-        box: two opposite corners (2, 3) [m] of a box along the axes; points outside are left out
-            first. None means no box.
+        up: unit vector (3,) that points up, in the frame of the cloud.
+        point: position (3,) [m] on or near the object, in the frame of the cloud. Points more than
+            0.5 m away (`PARTS.around`) are left out first. None means the object with the most
+            points above the plane.
+        box: two opposite corners (2, 3) [m] of a box along the axes of the cloud's frame. Points
+            outside are left out first. None means no box.
         gap: distance [m] beyond which points belong to different objects, 0.001 to 1.
 
     Raises `TooFewPoints` if fewer than 4 points are in the box, near `point`, above the plane, or

@@ -69,10 +69,12 @@ NORMALS = NormalNumbers()
 class NormalCheck(Value):
     """How well the normals of a cloud agree with the normals of neighbouring points.
 
-    `diagnose_cloud` makes it (`CloudReport.normals`) for n points of the cloud, all or drawn ones.
+    `diagnose_cloud` makes it (`CloudReport.normals`) for n points: all distinct points of the
+    cloud, or 5000 drawn ones. It does not tell which ones were drawn.
 
     Attributes:
-        flipped: mask (n,) of the normals that oppose most of their neighbours' normals.
+        flipped: mask (n,) of the normals that oppose most of their neighbours' normals. Its mean is
+            the share of flipped normals.
         opposed: share [0 to 1] of pairs of neighbours with opposite normals.
         oriented: False if the signs of the normals look random. The normals are then ignored.
         scaled: number of normals that are not of unit length.

@@ -68,7 +68,8 @@ class CloudFile(Value):
     Attributes:
         cloud: the points [m], in float64.
         notes: a sentence for each kind of data in the file that was left out.
-        table: plane of the table that the file holds, as `save_cloud` writes it; None without one.
+        table: plane of the table in the frame of the cloud, as `save_cloud` writes it. None if the
+            file holds none.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp(), "cloud.npy")
@@ -145,7 +146,7 @@ def read_cloud_file(
     """Read a cloud of any extent, such as a whole scene, with its table and notes on what was left
     out.
 
-    Formats and arguments are those of `read_cloud`.
+    Formats, arguments and what is left out are those of `read_cloud`.
 
     Raises:
         CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5
@@ -208,8 +209,8 @@ def cloud_from_array(
             columns. The last three are normals if they have length 1 and fit the surface. Otherwise
             they are taken for colours and left out.
         normals: outward normals in the shape of `points`; None without normals.
-        viewpoint: position (3,) [m] of the camera, or (n, 3) of each point's camera; None if it is
-            unknown.
+        viewpoint: position (3,) [m] of the camera, in the frame of the points. Or the positions of
+            each point's camera, in the shape of (n, 3) points. None if it is unknown.
 
     Raises the errors of `check_cloud`, and `CloudFileError` for arrays of another shape or type.
 
@@ -229,9 +230,10 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
     """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically; return the path.
 
     Args:
-        cloud: the points [m], with their normals, cameras and errors.
+        cloud: the points [m]. Their normals, cameras and errors are written, too.
         path: a file ending in `.npz` or `.ply`.
-        table: plane of the table, which is written, too; None without one.
+        table: plane of the table in the frame of the cloud, which is written, too. None without
+            one.
 
     Raises `OutputError` if the file cannot be written, and `BadArgument` for another suffix.
     `BadArgument` is also raised for a `.ply` of several views, or of a cloud with `pose_error`.

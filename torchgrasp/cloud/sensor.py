@@ -106,18 +106,19 @@ class SensorNoise(Value):
         disparity: standard deviation of the disparity [px]; only with a `base`.
         step: resolution of the disparity [px], to which it is rounded; 0 means no rounding. Only
             with a `base`.
-        floor: standard deviation [m] at any distance; `partial_view` draws it only without a
-            `base`.
-        growth: standard deviation over the squared distance [1/m]; only without a `base`.
+        floor: the part of the depth's standard deviation [m] that is the same at any depth.
+            `partial_view` draws it only without a `base`.
+        growth: the other part [1/m], which is multiplied by the squared depth; only without a
+            `base`. The squares of both parts add up (`sigma`).
         grain: standard deviation [px] of the Gaussian blur that makes neighbouring pixels have
             similar noise; 0 means independent pixels.
         bias: standard deviation [m] of the smooth bias of the depth.
         bias_width: standard deviation [px] of the Gaussian blur that makes the bias smooth.
         shadow: whether pixels are missing that the stereo camera's second lens does not see.
-        flying: share [0 to 1] of flying pixels at rims, whose depth is too great.
-        flight: mean distance [m] of flying pixels behind the rim.
-        lost_rim: share [0 to 1] of the pixels at rims without depth.
-        lost: share [0 to 1] of all pixels without depth.
+        flying: share [0 to 1] of the pixels at rims that fly, with a depth that is too great.
+        flight: mean error [m] of the depth of flying pixels.
+        lost_rim: share [0 to 1] of the pixels at rims that have no depth.
+        lost: share [0 to 1] of all pixels that are missing at random.
         grazing: angles [deg] between ray and surface normal at which pixels begin to be missing,
             and at which all are missing.
         multipath: error of a time-of-flight camera in a corner (no unit). The measured depth is too
@@ -164,9 +165,12 @@ class SensorNoise(Value):
 
     @checked
     def sigma(self, depth: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Return the standard deviation (*b,) [m] of the random noise at each depth (*b,) [m].
+        """Return the standard deviation (*b,) [m] of the random noise of the depth, at each depth.
 
         It contains neither the bias nor the rounding of the disparity. b stands for any batch axes.
+
+        Args:
+            depth: depths (*b,) [m].
         """
         disparity = math.hypot(self.disparity, self.fine)
         growth = disparity / self.base if self.base else self.growth

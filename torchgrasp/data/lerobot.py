@@ -37,12 +37,13 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
     folder.
 
     `LeRobotDataset(name, root=folder)` reads it. Each closing is an episode. Each control tick is a
-    frame, except the last one. Positions [m] and quaternions (x, y, z, w) are in the frame of the
-    grasp. There are no images and no rewards.
+    frame of the episode, except the last one. Positions [m] and quaternions (x, y, z, w) are in the
+    coordinate frame of the grasp. The hand's are those of its root link. There are no images and no
+    rewards.
 
     | feature | contents |
     | --- | --- |
-    | `observation.state` | all joints [rad or m] of the URDF, then position and quaternion of the hand |
+    | `observation.state` | all movable joints [rad or m] of the URDF, then position and quaternion of the hand |
     | `observation.forces` | force (x, y, z) [N] of each fingertip on the object, in the hand's frame |
     | `observation.environment_state` | position and quaternion of the object |
     | `action` | the next tick's joint targets [rad or m], then the hand's pose after that tick |

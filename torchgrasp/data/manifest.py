@@ -137,7 +137,7 @@ def write_objects(
 
     Each object is named after its file, without the suffix. Each mesh is translated: its lowest
     point is then at z = 0, and the centre of its bounding box above the origin. Each view is a
-    noisy cloud of at most 1000 points, rendered from a random direction (`partial_view`). The
+    noisy cloud of at most 1000 points, rendered from a random direction above (`partial_view`). The
     manifest, `manifest.json`, names all objects and views. It is written last, so a folder with a
     manifest is complete.
 
@@ -238,10 +238,10 @@ def list_views(
         whole: whether each object has only the view "whole" instead, a cloud of all its sides. Its
             file, OBJECT/full_normals.ply, is not among those that `write_objects` writes.
         only: names of the objects to list. Empty means all objects.
-        most: largest number of views of each object; None means all.
+        most: largest number of views of each object, the first by name. None means all.
 
     Raises `DatasetError` if there is no manifest, if it has no objects or lacks one of `only`, or
-    for a bad entry.
+    if the entry of an object in it is malformed.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -261,8 +261,8 @@ def list_views(
 def read_view(objects: Path | str, name: str, view: str, camera: bool = True) -> PointCloud:
     """Return the noisy point cloud [m] of a view, with the camera's position as `viewpoint`.
 
-    The cloud is in the frame of the object's mesh, multiplied by the object's scale in the manifest
-    (1 by default). It has no normals.
+    The cloud is in the frame of `read_object_mesh`. Its numbers are those of the file times the
+    object's scale in the manifest (1 by default). It has no normals.
 
     Args:
         objects: the folder of objects, as `write_objects` makes it.
@@ -272,8 +272,8 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
             writes.
         camera: whether the cloud has a `viewpoint`.
 
-    Raises `DatasetError` for a bad or missing entry, or an unknown view, and `CloudFileError` for a
-    bad file.
+    Raises `DatasetError` if there is no manifest, or if it has no valid entry of the object or the
+    view. Raises `CloudFileError` for a missing or malformed file of the cloud.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -298,11 +298,14 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
 def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
     """Return the true, closed mesh [m] of an object, in the frame of the object's views.
 
+    Its numbers are those of the file times the object's scale in the manifest (1 by default).
+
     Args:
         objects: the folder of objects, as `write_objects` makes it.
         name: name of the object.
 
-    Raises `DatasetError` for a bad or missing entry, and `MeshError` for a bad mesh.
+    Raises `DatasetError` if there is no manifest, or if it has no valid entry of the object. Raises
+    `MeshError` for a mesh that is missing, malformed, open or without volume.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())

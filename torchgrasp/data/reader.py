@@ -53,20 +53,23 @@ class GraspShards:
     float32, in the object's frame. n counts points, h actuated joints, and f fingertips:
 
     * `points` (n, 3) [m] and `viewpoint` (3,) [m] of the cloud; the viewpoint is 0 if unknown.
-    * `joints` (h,) and `pregrasp` (h,) [rad or m].
+    * `joints` (h,) of the grasp and `pregrasp` (h,) of the opened hand [rad or m].
     * `approach` (3,), the unit direction of the approach, and the pose `obj_from_hand` (4, 4) [m].
     * `contacts` (f, 3) [m], with the outward unit `normals` (f, 3) and the standard deviation
       `std_m` (f,) [m] of the surface there.
-    * `margin` and `witness` (6,) of the `Certificate`.
-    * `clearance` [m].
+    * `margin`, a number, and `witness` (6,) of the `Certificate`.
+    * `clearance` [m], the least distance of links from surface, table and each other (`Grasps`).
     * `predicted`, the predicted success in [0, 1]; NaN where no trial supports it.
-    * `simulated`, the share of simulated trials that passed.
+    * `simulated`, the share in [0, 1] of the grasp's simulated trials that passed.
     * `closed`, a boolean: whether the contacts have frictional form closure.
     * `job`, an integer: the index in `jobs` of the grasp's view.
 
+    An index out of range raises `IndexError`, and a damaged file `ModelFileError`.
+
     Attributes:
         folder: folder of the data set.
-        card: content of `card.json`.
+        card: content of `card.json`: "licence", "asked" (the settings of the campaign), "counts",
+            "jobs" and others.
         jobs: the outcome of each view of each object, with or without grasps.
         size: number of jobs in a shard, a file of the data set.
         points: number of points of each item's cloud. None means all points, so that clouds may

@@ -33,8 +33,9 @@ class JobRow(NamedTuple):
     Attributes:
         object: name of the object.
         view: name of the view; "" if the object could not be read, or has no view.
-        status: `OK` if there is a grasp. Else the most frequent failure of the plan, `BAD_OBJECT`,
-            or how the process ended.
+        status: `OK` if a grasp is executable. Else it is the most frequent failure of the plan, or
+            `BAD_OBJECT` for bad files or a failed plan. It is `TIMED_OUT`, `WORKER_DIED` or
+            `BROKEN` if the work on the job did not end.
         note: details of the status, or "".
         family: name of a family of similar objects, or "".
         group: group of objects, such as "solid", or "".

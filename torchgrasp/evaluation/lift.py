@@ -117,7 +117,6 @@ def close_hand(
         BadArgument: there is not exactly one grasp, or its approach is no unit vector.
         BadArgument: joints are of another hand, or a pre-grasp is outside the joint limits.
         BadArgument: contacts are off the mesh, or the mesh does not stand on the `table`.
-        BadArgument: the holding "law" after a closing that does not follow it (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
 

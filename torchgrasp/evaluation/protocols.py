@@ -39,7 +39,7 @@ class PoseNoise(Value):
     Args:
         translation: greatest error [m] along each axis.
         rotation: greatest error [rad] about each axis; in lifts about the vertical only.
-        draws: number of trials with different errors that `evaluate` runs for each grasp.
+        draws: number of trials that `evaluate` runs for each grasp, each with its own error.
     """
 
     translation: Length = 0.0
@@ -72,7 +72,7 @@ class Protocol(Value):
     """The settings of the simulated trials that test a grasp: pulls at a floating object, or a lift
     off a table.
 
-    `PROTOCOLS` holds ready protocols by name, published ones among them.
+    `PROTOCOLS` holds ready protocols by name, such as "tabletop" and "dexgraspbench".
 
     Args:
         name: the protocol's name.

@@ -51,8 +51,9 @@ def lift_grasps(
 
     The robot may feel that the object slides or stays behind (`LiftCheck`), or that it is too
     heavy. Then the hand goes down, opens and withdraws; the object stays where it is. The robot
-    estimates the object's new pose from the touches, or looks again. Of the remaining grasps it
-    tries the one that most likely holds there (`GraspTry.next`).
+    estimates the object's new pose from the touches. With a `trial.truth.camera` it looks at the
+    object before each try. Of the remaining grasps it tries the one that most likely holds there
+    (`GraspTry.next`).
 
     Args:
         trial: the hand, grasps in the order of preference, and the true object. `trial.truth.error`

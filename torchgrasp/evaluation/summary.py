@@ -56,10 +56,11 @@ class ProtocolResult(Value):
         tries: number of grasps that were tried. `rank`, `predicted`, `overlap`, `gap_mm`,
             `deepest_mm` and `touch` are those of the first grasp, all other numbers those of the
             last.
-        cause: why a lift did not hold the object, such as "slid"; "" if it was held, if the
-            simulation diverged, or in pulls.
-        size: size of the cause in the cause's unit: [mm] of "slid", [deg] of "turned", [N] of "too
-            weak".
+        cause: why a lift did not hold the object: "start overlap", "toppled", "pushed away",
+            "ejected", "shape off", "never met", "too weak", "dropped when pushed", "turned" or
+            "slid". It is "" if the object was held, if the simulation diverged, or in pulls.
+        size: size of the cause. It is an angle [deg] for "toppled" and "turned", and a force [N]
+            for "too weak" and "dropped when pushed". For others it is a distance [mm].
         gap_mm: largest gap [mm] between a fingertip and the object at the planned posture. It is
             measured before any force and without a pose error.
         deepest_mm: smallest such gap [mm]; negative if the fingertip penetrates the object.
@@ -106,9 +107,12 @@ class ViewScore(Value):
         object: name of the object.
         view: name of the view; "" if the object could not be read.
         executable: number of executable grasps that were planned.
-        seconds: CPU time [s] of planning; NaN if it was not measured.
+        seconds: CPU time [s] of planning. It is 0 for grasps that were read (`planned`). It is NaN
+            if the object could not be read, or planning did not end.
         attempts: results of the trials, one for each tried grasp and pose error.
-        refusal: `OK` if a grasp is executable; else the most frequent failure of the plan.
+        refusal: `OK` if a grasp is executable; else the most frequent failure of the plan. It is
+            `BAD_OBJECT` for bad files or a failed plan. It is `TIMED_OUT` or `WORKER_DIED` if
+            planning did not end. It is `OUT_OF_REACH` if no failure is known.
         note: details of the refusal, or "".
         family: name of a family of similar objects, or "".
         group: group of the object, such as "solid", or "".
@@ -142,8 +146,8 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     Success rates are `Share` values. Their 95 % intervals resample families of objects.
 
     * "gsr": grasp success rate, the share of trials that passed.
-    * "top1": share of trials of best-ranked grasps that passed; a view without grasps counts as
-      failed.
+    * "top1": share of trials of best-ranked grasps that passed. A view without a trial counts as
+      failed, once for each drawn pose error.
     * "objects": share of objects with at least one trial that passed.
     * "refused": number of views without a trial.
     * "executable": number of executable grasps.
@@ -152,7 +156,8 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
       grasp, and so on.
     * "failures": the number of each status by stage: planning, start, closing, pulling or lifting,
       simulation.
-    * "causes": for each cause why a lift did not hold: its "count", "by_group" and "median" size.
+    * "causes": for each `ProtocolResult.cause` its "count" and the counts "by_group". "median" is
+      that of `ProtocolResult.size`, in the unit of the cause, or NaN.
     * "fingers": numbers of views with an executable grasp, by the grasping fingers.
     * "force_n" [N], "overlap_mm" [mm], "plan_cpu_s" [s], "trial_cpu_s" [s]: means, or None.
     * "overlap_mm_max": largest overlap [mm], or None. "cpu_s": total CPU time [s].
@@ -162,8 +167,10 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     * "touch": number of each verdict on these gaps (`measure_touch`).
     * "success": how well predicted success fits the outcomes, or None without predictions.
       "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for
-      perfect predictions, and 0 for always the mean. "auc" is the area under the ROC curve. "error"
-      is the expected calibration error over the "bins".
+      perfect predictions, and 0 for always the mean. "auc" is the area under the ROC curve. Both
+      are NaN if all trials passed, or none. "error" is the expected calibration error over the
+      "bins". A bin holds the predictions from `low` to `high`. Its `predicted` is their mean, and
+      `passed` the `Share` of their trials that passed.
 
     >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
     >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)

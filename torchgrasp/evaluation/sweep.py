@@ -59,8 +59,8 @@ def evaluate(
         folder: folder in which the executable grasps of each view are saved, as
             OBJECT/VIEW.safetensors. None means a temporary folder. No other run may write to it at
             the same time.
-        workers: number of worker processes. 0 means this process, without time limits. The scores
-            do not depend on it.
+        workers: number of worker processes. 0 means this process, without time limits. Apart from
+            CPU times and tasks that are ended at a limit, the scores do not depend on it.
 
     Raises:
         BadArgument: the protocol is unknown.

@@ -116,7 +116,7 @@ def measure_touch(
         grasps: g grasps; only `joints` and `obj_from_hand` are used.
         surface: the object's mesh [m] with faces turned outward, or its cloud [m], in the frame of
             the grasps.
-        limit: largest gap [m] of a fingertip that counts as touching.
+        limit: largest size [m] of a gap of either sign at which a fingertip counts as touching.
 
     Raises `BadArgument` for joints of another hand or beyond their limits, and for a cloud whose
     normals cannot be estimated.

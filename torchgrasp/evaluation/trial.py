@@ -76,7 +76,8 @@ class Truth:
             error.
         table: the true table below the object. None means a level table at the mesh's lowest point.
         neighbours: other bodies on the table, which the hand may push.
-        slide: displacement (3,) [m] of the object halfway through the approach; None means none.
+        slide: displacement (3,) [m] of the object along the table, halfway through the approach.
+            None means no displacement.
         camera: pose (4, 4) [m] of a depth camera (x right, y down, z forward) with which the robot
             looks again before the approach. None means no second look.
     """

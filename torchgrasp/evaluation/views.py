@@ -65,13 +65,15 @@ class EvaluationSpec(Value):
             They are the views "whole" of `read_view`.
         only: names of the objects to evaluate; empty means all.
         planned: whether to read the grasps that an earlier call of `evaluate` saved in its
-            `folder`, instead of planning.
+            `folder`, instead of planning. A view whose file is missing or of another cloud or hand
+            is refused (`BAD_OBJECT`).
         seed: seed of the planner, of the pose errors and of the trials.
-        views: largest number of views of each object; None means all views.
+        views: largest number of views of each object, the first by name. None means all views.
         fingers: the fingers that grasp (`load_hand`); None means the hand's own. "auto" takes for
             each view the fingers most likely to succeed.
 
-    Raises `BadArgument` for no grasps, or unknown ranks.
+    Raises `BadArgument` for a number below 1 of `grasps`, `starts` or `views`, and for unknown
+    `ranks`. Unknown `fingers` are refused when a view is planned (`BAD_OBJECT`).
     """
 
     grasps: Count = 20

@@ -31,7 +31,7 @@ class ArmMotion(Value):
     Attributes:
         joint_names: names of the j joints: first the arm's, then all movable joints of the hand.
         times: times (t,) [s] from the start, beginning at 0.
-        positions: targets (g, t, j) [rad, or m for sliding joints] of these joints.
+        positions: target positions (g, t, j) [rad, or m for sliding joints] of these joints.
         phases: index into `times` of each named moment. At "above" the opened hand is before its
             pre-grasp, and at "pregrasp" it has arrived. At "grasp" the fingers are on the contacts,
             and at "squeeze" their targets press. At "lift" the hand has lifted the object.

@@ -111,8 +111,10 @@ def read_foreign(
             known.
         order: names (as in the hand's URDF) of the numbers in a posture of the file, in their
             order. `JOINT:FACTOR` or `JOINT:FACTOR:OFFSET` convert a number of another sign, unit or
-            zero [rad]. Numbers under names that the hand does not have are not read.
-        quaternion: order of the four numbers after the position in a pose.
+            zero [rad]. Numbers under names that the hand does not have are not read. () serves
+            files that name their joints, and the Allegro hand's files of DexGraspBench.
+        quaternion: order of the four numbers after the position in a pose, "wxyz" or "xyzw". Files
+            that name their numbers need none.
         unit_m: length [m] of one unit of the positions in the file.
         root: the hand's frame whose poses the file has: a link of the hand's URDF, or the pose (4,
             4) [m] of its root link in that frame. "" means the link that the file names
@@ -123,7 +125,8 @@ def read_foreign(
         ModelFileError: the file is missing or malformed, or names a root link that the hand does
             not have.
         ModelFileError: joints fit only with another sign, or do not follow as the hand's joints do.
-        BadArgument: the `order` misses a joint.
+        BadArgument: the `order` misses an actuated joint, has a name twice, or has a factor that is
+            0 or no number.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand

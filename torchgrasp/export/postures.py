@@ -49,10 +49,10 @@ def format_grasps(
     numbers.
 
     A robot plays a grasp in three steps. In the posture "pregrasp" the hand moves along "approach"
-    to its "pose", displaced by "rise". Then it moves to "pose" and closes to "grasp". At last it
-    moves towards "squeeze", targets with which the fingers press. The times are in "time"; joints
-    move at constant speeds. Poses are in the object's frame, which is the frame of the planned
-    cloud.
+    to its "pose", displaced by the vector "rise" [m]. Then it moves to "pose" and closes to
+    "grasp". At last it moves towards "squeeze", targets with which the fingers press. "rise" is 0
+    unless the opened fingers would be in the table. The times are in "time"; joints move at
+    constant speeds. Poses are in the object's frame, which is the frame of the planned cloud.
 
     Args:
         hand: the hand.
@@ -61,7 +61,7 @@ def format_grasps(
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
         rename: the robot's names of joints, by their names in the URDF; None keeps all names.
         flange: pose (4, 4) [m] of the robot's flange in the frame of the hand's root link. With it,
-            the flange's pose is added as "flange".
+            the flange's pose is added as "flange". None adds nothing.
 
     Raises `BadArgument` for joints of another hand, and for names that are unknown, empty or equal.
     It is also raised for a `force` outside 0.01 to 100 N, or a `kp` that is not positive.

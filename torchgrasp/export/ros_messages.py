@@ -180,7 +180,8 @@ def format_motion(hand: Hand, motion: ArmMotion, actuated: bool = False) -> str:
     Args:
         hand: the hand on the arm.
         motion: the motions, from `plan_motion`.
-        actuated: whether to leave out coupled joints of the hand, which follow others.
+        actuated: whether to leave out coupled joints of the hand, which follow others. Controllers
+            of ros2_control refuse their names.
 
     >>> import torch
     >>> from torchgrasp import load_hand

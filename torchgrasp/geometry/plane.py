@@ -78,7 +78,8 @@ class Plane(Value):
     def moved(self, b_from_a: Pose) -> "Plane":
         """Return the same plane in another frame b, in float64.
 
-        `b_from_a` is the rigid transform (4, 4) [m] from the plane's present frame a to b.
+        `b_from_a` is the rigid transform (4, 4) [m] from the plane's present frame a to b. Raises
+        `BadArgument` for a transform that is not rigid.
         """
         normal = b_from_a[:3, :3].double() @ self.normal.double()
         return Plane(unit(normal), self.offset + float(normal @ b_from_a[:3, 3].double()))

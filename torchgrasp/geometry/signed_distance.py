@@ -154,7 +154,7 @@ class SignedDistanceField(DistanceField):
     object.
 
     `surface_field` makes it of an estimated shape. The grid is along the axes of the object's
-    frame.
+    frame. `query` returns distance and gradient at any points, interpolated between the nodes.
 
     Args:
         origin: position (3,) [m] of node (0, 0, 0).

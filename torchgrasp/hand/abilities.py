@@ -44,10 +44,11 @@ class FingerAbility:
         name: name of the finger.
         tip_link: name of the link of its tip.
         joints: number of the actuated joints that move the tip.
-        force: greatest normal force [N] of the tip in the median free posture. NaN if no joint
-            moves the contact point along its normal: then the structure carries the load.
-        sure_force: greatest normal force [N] that is reached in 90 % of the free postures. NaN as
-            for `force`.
+        force: greatest normal force [N] of the tip, the median over the free postures. NaN if in
+            half of them no joint moves the contact point along its normal: then the structure
+            carries the load.
+        sure_force: normal force [N] that the tip reaches in 90 % of the free postures. NaN if in
+            these no joint moves the contact point along its normal.
 
     Both forces act at the contact point of the pad, along the pad's normal. No other finger
     presses, and each actuated joint exerts at most its effort. A posture is free if no links of the
@@ -129,8 +130,9 @@ class HandAbilities:
     def content(self) -> dict[str, Any]:
         """Return the abilities as a dict for JSON.
 
-        Keys of numbers with a unit end with it, as `force_n`. Numbers have six significant digits.
-        NaN becomes None.
+        It holds all fields, with a dict for each finger and each pair. Spans and widths are lists
+        of the least and the greatest. Keys of numbers with a unit end with it, as `force_n`; those
+        of shares end with "_share". Numbers have six significant digits. NaN becomes None.
         """
         fingers = [
             {

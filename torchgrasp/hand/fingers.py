@@ -216,7 +216,7 @@ class Fingertips(Value):
     @kept
     def cone(self) -> Float[Tensor, "f"]:
         """Half angle (f,) [rad] of the cone about each pad's normal in which the pad may touch a
-        surface.
+        surface; a cached property.
         """
         # float32, as when results were published
         angles = self.radius.new_tensor([ROUND_PAD, FLAT_PAD], dtype=torch.float32)
@@ -228,7 +228,7 @@ class Fingertips(Value):
     ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
         """Contact points [m], unit normals and sphere centres [m] of the pads, each (f, 3).
 
-        Each is in the frame of the tip's carrier.
+        Each is in the frame of the tip's carrier. It is a cached property.
         """
         pose = self.carrier_from_tip
         contact = map_points(pose, self.contact)[..., 0].T

@@ -143,7 +143,7 @@ class Hand(Value):
         """Tables of how collision spheres, fingertips and pad normals move with the hand's pose and
         joints.
 
-        They serve `solve_ik`.
+        It is a cached property that serves `solve_ik` alone. Its class `FreeMotion` is not public.
         """
         spheres = self.collision_spheres
         tips = self.tips

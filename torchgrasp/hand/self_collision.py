@@ -140,7 +140,8 @@ class SelfCollision(Value):
         * `separations` (p, n) [m] are those of the method `separations`.
         * `index` (p, n) is the column in `wrenches` of each pair in each posture.
         * `wrenches` (6, k) are derivatives of a separation by a twist of the pair's second shape:
-          three by its translation, then three [m/rad] by its rotation about the origin.
+          three by its translation, then three [m/rad] by its rotation about the origin. Axes and
+          origin are those of the frame of `frames`.
 
         The wrench of a pair that is at least `below` apart is zero.
 

@@ -195,8 +195,14 @@ class Explanation(Value):
     Attributes:
         starts: number of initial guesses from which grasps were planned, without a change and with
             each.
-        funnel: how many candidates each planning stage lost, and why, without a change.
-        trials: the result of planning with each change, the most helpful first.
+        funnel: how many candidates each planning stage lost, and why, without a change. Its field
+            `stages` holds "contacts", "postures" and "grasps", in this order. Each has its
+            name `stage`, and the numbers `given` and `kept` of its `things`. The dict `lost` has
+            the number lost for each `Status`.
+        trials: the result of planning with each change, the most helpful first. Its `words`
+            describe the change, and `choice` is whether the user can make it. `executable` is the
+            number of grasps, `expected` their mean predicted success as in `best`, and `funnel` the
+            losses.
         left: number of further changes that were not tried, to bound the work.
 
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))

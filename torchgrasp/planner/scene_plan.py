@@ -68,8 +68,9 @@ class ScenePlan(Value):
     Attributes:
         things: one plan for each object; objects without a grasp come last.
         clear: labels of objects to take away, in this order, so that the `target` of `plan_scene`
-            has a grasp. It is empty if the target has one, if no small number of objects suffices,
-            or without a target.
+            has a grasp. It is empty without a target, if the target has a grasp, or if its
+            `ThingPlan.status` rules one out. It is also empty if up to three objects do not
+            suffice.
 
     >>> empty = ThingPlan(1, success=0.0, reason="too flat")
     >>> ScenePlan((empty,)).best is None
@@ -111,9 +112,9 @@ def plan_scene(
     first.
 
     Nothing is planned for an object if its image shows that it cannot be grasped
-    (`Status.FEW_PIXELS` to `TOO_VAGUE`). Of the other objects, near and tall ones with free space
-    around them are planned first. Objects that are larger than all objects in our trials, or cut
-    off by the image border, are planned last.
+    (`Status.FEW_PIXELS` to `TOO_WIDE`), or if its estimated shape is `TOO_VAGUE`. Of the other
+    objects, near and tall ones with free space around them are planned first. Objects at the image
+    border, or too large for a prediction of success, are planned last.
 
     With a `target`, only this object is planned. If it has no grasp, it is planned again without
     the nearest objects. `ScenePlan.clear` then says which of them to take away.
@@ -131,8 +132,11 @@ def plan_scene(
             `hand_of` loads the hand of its grasps.
         task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
 
-    Raises `BadArgument` for a scene without objects, an unknown `target`, or an argument of the
-    wrong type or range.
+    Raises:
+        BadArgument: a scene without objects, an unknown `target`, unknown `fingers`, or an argument
+            of the wrong type or range.
+        CloudFileError: a file of a scene that is missing or malformed.
+        HandFileError: there is no such hand, or its files are malformed.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=12, enough=0.5)

@@ -67,15 +67,24 @@ class Neighbour:
 @checked
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A rigid body of uniform density."""
+    """A rigid body of uniform density in a simulated scene; `SceneSpec.neighbours` takes it.
 
-    mesh: "trimesh.Trimesh"  # mesh of the body [m]
-    parts: "Sequence[trimesh.Trimesh]"  # convex parts of the mesh [m]
-    mass: float  # mass of the body [kg]
+    Args:
+        mesh: closed mesh [m] of the body, in the world's frame at its initial pose.
+        parts: convex parts [m] whose union approximates the mesh, as `convex_parts` returns them.
+        mass: mass [kg] of the body.
+    """
+
+    mesh: "trimesh.Trimesh"
+    parts: "Sequence[trimesh.Trimesh]"
+    mass: float
 
     @property
     def inertia(self) -> np.ndarray:
-        """The matrix of inertia (3, 3) [kg m^2] about the centre of mass, for uniform density."""
+        """The matrix of inertia (3, 3) [kg m^2] about the centre of mass, for uniform density.
+
+        Its axes are those of the mesh's frame.
+        """
         return np.asarray(self.mesh.moment_inertia) * (self.mass / self.mesh.volume)
 
 
@@ -89,8 +98,8 @@ class SceneSpec:
     Args:
         urdf_path: URDF of the hand.
         world_from_hand: pose (4, 4) [m] of the hand's root link at the end of the approach.
-        joints: start position [rad or m] of every joint of the URDF, by name.
-        drives: drive of every joint of the URDF, by name.
+        joints: start position [rad or m] of every movable joint of the URDF, by name.
+        drives: drive of every movable joint of the URDF, by name.
         tip_links: names of the links of the f fingertips, in the order of the grasp's contacts.
         mesh: closed mesh [m] of the object, which gives table height, centre of mass and inertia.
         parts: convex bodies [m] that make up the object.
@@ -104,15 +113,15 @@ class SceneSpec:
         patch: radius [m] of a fingertip's contact patch. Torsional friction is friction x force x
             patch.
         height: height [m] of the table; None means the lowest point of the mesh.
-        neighbours: other bodies on the table.
+        neighbours: other bodies on the table, each a `Body`.
         self_pairs: names of the two links of each pair of the hand's links that can collide.
         yields: largest displacement [m] of the mount along each axis of the world, beside approach
             and lift; 0 allows none.
         start: initial displacement (x, y, z) [m] of a mount that `yields`.
         table_friction: friction coefficient of objects with the table and with each other; None
             means `friction`.
-        mount: all prismatic joints of the mount; None means those that `travel`, `approach` and
-            `yields` need.
+        mount: all prismatic joints of the mount, each a `Slide`, from the world to the hand. None
+            means those that `travel`, `approach` and `yields` need.
     """
 
     urdf_path: Path | str
@@ -140,7 +149,7 @@ class SceneSpec:
 
     @functools.cached_property
     def urdf(self) -> Urdf:
-        """The parsed URDF of the hand.
+        """The parsed URDF of the hand, with tuples of its `links` and `joints` in the file's order.
 
         Raises `HandFileError` if the file is not valid.
         """
@@ -150,8 +159,8 @@ class SceneSpec:
     def slides(self) -> list["Slide"]:
         """The prismatic joints of the mount that carries the hand, from the world to the hand.
 
-        Each has its name, its unit axis in the world's frame, its limits [m] and its start position
-        [m].
+        They are `mount` if it is given. Otherwise they are those of lift, approach and yielding,
+        as far as `travel`, `approach` and `yields` need them.
         """
         if self.mount is not None:
             return list(self.mount)
@@ -190,8 +199,9 @@ class SceneSpec:
         """The vertices (v, 3) [m] of all convex parts: a list for the object, then one for each
         neighbour.
 
-        Vertices less than 0.3 mm above the table, or below it, are moved onto it. Otherwise a
-        scanned round body would roll away on its facets before it is touched.
+        They are in the world's frame, at the bodies' initial poses. Vertices less than 0.3 mm above
+        the table, or below it, are moved onto it. Otherwise a scanned round body would roll away on
+        its facets before it is touched.
         """
         lowest = self.table_height + SIMULATION.near if self.table else -math.inf
         found = []
@@ -204,7 +214,7 @@ class SceneSpec:
 
     @checked
     def check_drives(self, names: list[str]) -> None:
-        """Raise `BadArgument` if a joint in `names` has no start position or no drive."""
+        """Raise `BadArgument` if a joint in `names` is missing in `joints` or in `drives`."""
         missing = [name for name in names if name not in self.joints or name not in self.drives]
         if missing:
             found = f"no position or drive for {missing}"
@@ -218,13 +228,23 @@ WRIST_JOINT = "torchgrasp_wrist"  # name of the fixed joint between mount and ha
 
 
 class Slide(NamedTuple):
-    """A prismatic joint of the mount."""
+    """A driven prismatic joint of the mount that carries a simulated hand (`SceneSpec.mount`).
+
+    Attributes:
+        name: name of the joint. "torchgrasp_lift" is what `SimulatedScene.lift` moves, and
+            "torchgrasp_approach" what `approach` moves. "torchgrasp_shift_x", "torchgrasp_shift_y"
+            and "torchgrasp_shift_z" are what `shift` moves.
+        axis: unit vector (x, y, z) of the motion in the world's frame.
+        lower: least position [m] along the axis.
+        upper: greatest position [m] along the axis.
+        start: initial position [m] along the axis.
+    """
 
     name: str
-    axis: tuple[float, float, float]  # unit vector (x, y, z) in the world's frame
-    lower: float  # limit [m]
-    upper: float  # limit [m]
-    start: float  # initial position [m]
+    axis: tuple[float, float, float]
+    lower: float
+    upper: float
+    start: float
 
 
 def mounted_urdf(spec: SceneSpec) -> str:

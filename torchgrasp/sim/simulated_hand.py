@@ -61,7 +61,7 @@ class SimulatedHand:
         generator: source of the noise of the fingertips' sensors; None means no noise.
 
     Attributes:
-        truth: the true contacts of the last tick, in the hand's frame.
+        truth: the true contacts (`TipContact`) of the last tick, in the hand's frame.
         force: true normal forces (f,) [N], averaged over the last tick.
         pushes: full forces (f, 3) [N] of the fingertips on the object, in the world's frame,
             averaged over the last tick.

@@ -24,18 +24,27 @@ with the object.
 
 @dataclasses.dataclass(frozen=True)
 class StepContacts:
-    """True contacts of f fingers with the object, in the world's frame, summed over a simulation
-    step.
+    """The true contacts of a hand during one timestep; `SimulatedScene.step` returns it.
+
+    Arrays are in the world's frame. f counts the fingertips, in the order of the grasp's contacts.
+
+    Attributes:
+        impulse: normal impulse (f, 3) [N s] of each fingertip on the object, without friction.
+        moment: contact points (f, 3) [N s m] of each fingertip, summed with the size of their
+            normal impulse as weight. `moment / weight` is the mean contact point [m].
+        weight: sum (f,) [N s] of these sizes.
+        finger: mask (f,) of the fingers that touch the object, with the fingertip or with the link
+            that carries it.
+        force: force (f, 3) [N] of each fingertip on the object, with friction.
+        stray: sums (3,) [N s] of the sizes of other normal impulses: of the hand on neighbours, of
+            the hand on the table, and of other links on the object.
     """
 
-    impulse: np.ndarray  # normal impulse on the object (f, 3) [N s], without friction
-    moment: np.ndarray  # contact points weighted by the size of their impulse (f, 3) [N s m]
-    # sum of the impulse sizes (f,) [N s]; `moment / weight` is the mean contact point
+    impulse: np.ndarray
+    moment: np.ndarray
     weight: np.ndarray
-    # whether each finger touches (f,), with its tip or with the link that carries the tip
     finger: np.ndarray
-    force: np.ndarray  # force (f, 3) of each fingertip on the object [N], with friction
-    # sums of other impulses (3,) [N s]: hand on neighbours, hand on table, links on object
+    force: np.ndarray
     stray: np.ndarray
 
 
@@ -43,8 +52,8 @@ class SimulatedScene(abc.ABC):
     """A simulated scene of one trial: table, object, neighbours and a hand; `open_scene` makes it.
 
     Arrays are in the world's frame. The hand is carried by a mount, a chain of prismatic joints
-    (`SceneSpec.slides`). The j driven joints are all movable joints of the hand's URDF. f counts
-    the fingertips, in the order of the grasp's contacts.
+    (`SceneSpec.slides`), each with a motor. The j driven joints are all movable joints of the
+    hand's URDF. f counts the fingertips, in the order of the grasp's contacts.
 
     Attributes:
         joint_names: names of the j driven joints, in the order of every array of joints.
@@ -84,8 +93,10 @@ class SimulatedScene(abc.ABC):
                 self._finger_of.setdefault(carrier, i)
 
     def step(self) -> StepContacts:
-        """Advance by one timestep; return the contacts of the hand during it, summed for each
-        finger.
+        """Advance by one timestep; return the contacts of the hand during it.
+
+        The result holds impulses [N s], forces [N] and contact points (`StepContacts`), summed for
+        each fingertip.
         """
         sums = [[0.0] * 10 for _ in self.tips]
         finger = [False] * len(self.tips)
@@ -150,7 +161,10 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def drive(self, targets: np.ndarray) -> None:
-        """Set the targets (j,) [rad or m] of the j driven joints, until the next call."""
+        """Set the targets (j,) [rad or m] of the position control of the j driven joints.
+
+        They hold until the next call.
+        """
 
     @abc.abstractmethod
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
@@ -185,7 +199,8 @@ class SimulatedScene(abc.ABC):
     def penetration(self) -> float:
         """Return the largest depth [m] by which the hand penetrates another body or itself.
 
-        It is at most 0 if the hand penetrates nothing. Call it before the first step.
+        It is at most 0 if the hand penetrates nothing. Call it before the first step. It is no mere
+        query: with SAPIEN it advances the scene by a timestep, in which objects do not fall.
         """
 
     @abc.abstractmethod
@@ -200,26 +215,41 @@ class SimulatedScene(abc.ABC):
 
     @checked
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the target of the lift: the height [m] of the mount above its start, and a speed
-        [m/s].
+        """Set the target of the lift along the world's z axis, until the next call.
 
-        Both are along the world's z axis.
+        A motor of the mount holds the position `height` and the speed `speed` like a spring and a
+        damper. A `height` above `SceneSpec.travel` may not be reached.
+
+        Args:
+            height: target height [m] of the mount above its start.
+            speed: speed [m/s] at which the target itself moves. 0 means that the mount comes to
+                rest at `height`.
         """
         self._move_mount(LIFT_JOINT, height, speed)
 
     @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
-        """Set the target of the approach: the distance `left` [m] to its end, and a speed [m/s]."""
+        """Set the target of the approach along `SceneSpec.approach`, until the next call.
+
+        Only for a scene whose `SceneSpec.approach` is not zero.
+
+        Args:
+            left: target distance [m] that is left to the end of the approach.
+            speed: speed [m/s] at which the target itself moves forward; negative backward. 0 means
+                that the mount comes to rest at `left`.
+        """
         self._move_mount(APPROACH_JOINT, -left, speed)
 
     @checked
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
-        """Set the target of the mount's displacement from its path; only for `SceneSpec.yields`
-        above 0.
+        """Set the target of the mount's displacement beside approach and lift, until the next call.
+
+        Only for a scene whose `SceneSpec.yields` is above 0.
 
         Args:
-            displacement: displacement (3,) [m] in the world's frame.
-            velocity: velocity (3,) [m/s] in the world's frame.
+            displacement: target displacement (3,) [m] in the world's frame.
+            velocity: velocity (3,) [m/s] in the world's frame at which the target itself moves. 0
+                means that the mount comes to rest at `displacement`.
 
         Raises `BadArgument` for arrays of another shape, or without numbers.
         """
@@ -232,11 +262,14 @@ class SimulatedScene(abc.ABC):
             self._move_mount(joint, target, speed)
 
     def neighbour_poses(self) -> np.ndarray:
-        """Return the poses (m, 4, 4) [m] of the m neighbours in the world's frame."""
+        """Return the poses (m, 4, 4) [m] of the m neighbours in the world's frame.
+
+        They are in the order of `SceneSpec.neighbours`. A body has the identity at its start.
+        """
         return np.array([self._pose(body) for body in self.neighbours]).reshape(-1, 4, 4)
 
     def object_pose(self) -> np.ndarray:
-        """Return the object's pose (4, 4) [m] in the world's frame."""
+        """Return the object's pose (4, 4) [m] in the world's frame; the identity at the start."""
         return self._pose(self.body)
 
     def hand_pose(self) -> np.ndarray:

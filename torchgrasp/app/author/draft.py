@@ -82,8 +82,9 @@ class Draft(NamedTuple):
         urdf: text of the repaired URDF, which the hand.toml names. It is "" if nothing had to be
             repaired; the hand.toml then names the published URDF.
         repairs: a sentence for each repair of the URDF.
-        warnings: a sentence for each number of the URDF that is implausible for a hand, and for
-            each guess that is likely wrong. `toml` repeats them as comments.
+        warnings: sentences on implausible numbers of the URDF and guesses that are likely wrong.
+            They also name links without <collision>, pairs of links that often collide, and what
+            of an MJCF is left out. `toml` repeats them as comments.
         meshes: bytes of each visual mesh file that `urdf` names, by its path relative to the URDF.
             Only pictures use them.
     """
@@ -103,7 +104,7 @@ class Wish(NamedTuple):
             means the last link of each branch.
         name: name of the hand; "" means the robot's name in the URDF.
         root: name of the hand's first link, if the URDF also has an arm. Links that are not below
-            it are left out.
+            it are left out. "" means the root link; in an MJCF, the body whose links have motors.
         meshes: folder in which all mesh files lie; None means the folder of the URDF.
         visual: whether links without <collision> take their <visual> as collision shapes.
         tip_offset: lengths [m] by which tactile sensors extend the fingertips. () means no sensors.
@@ -178,8 +179,8 @@ def new_hand(
         file: name of the file in which the user saves the repaired URDF; the hand.toml names it.
 
     Raises:
-        HandFileError: a file or a mesh that is missing, malformed or refused; no collision shape;
-            or a fault that cannot be repaired.
+        HandFileError: a file or a mesh that is missing, malformed, too large or outside its folder.
+        HandFileError: no collision shape, or a fault that cannot be repaired.
         BadArgument: an unknown root; fewer than three tips or more than five; a tip without a
             collision shape or a movable joint; or a bad length or radius of a sensor.
         MissingExtra: an MJCF without MuJoCo.
@@ -400,8 +401,8 @@ def clean_arm(path: Path | str, meshes: Path | str | None = None) -> str:
         path: the published URDF of the arm.
         meshes: folder in which all mesh files lie; None means the folder of the URDF.
 
-    Raises `HandFileError` for a URDF or a mesh that is missing, malformed or refused, and for a
-    sliding joint without limits.
+    Raises `HandFileError` for a URDF or a mesh that is missing, malformed, too large or outside its
+    folder. It is also raised for a sliding joint without limits.
 
     >>> from torchgrasp import load_hand
     >>> clean_arm(load_hand("barrett").urdf_path).splitlines()[0]

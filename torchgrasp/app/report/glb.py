@@ -54,8 +54,11 @@ def write_glb(
         body: the object's mesh [m] in the frame of the grasp, or its estimated surface. The surface
             is coloured by its standard deviation.
 
-    Raises `BadArgument` if there is not exactly one grasp, or if the grasp does not touch the mesh.
-    Raises `OutputError` if the file cannot be written.
+    Raises:
+        BadArgument: there is not exactly one grasp, or its joints are of another hand.
+        BadArgument: the grasp does not touch the mesh, or the mesh floats above the grasp's table
+            or sinks far into it. An estimated surface is not checked.
+        OutputError: the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object

@@ -36,17 +36,21 @@ Index = tuple[str, str, np.ndarray]
 def write_recording(path: Path | str, run: Run) -> Path:
     """Write a run as a recording for the viewer Rerun, atomically; return the path.
 
-    `rerun FILE.rrd` opens it. Lengths are in metres. These entities are in the frame of the cloud:
+    `rerun FILE.rrd` opens it. Lengths are in metres. The entity `world/obj` is the frame of the
+    cloud. It holds these entities:
 
-    * `cloud`, `surface` coloured by its standard deviation, and `contacts` as arrows along the
-      outward normals.
+    * `cloud`, and `surface` coloured by its standard deviation.
+    * `contacts` of the best grasp, as arrows along the outward normals.
     * `plan/hand`: the best grasp on the timeline `posture`: approach, pre-grasp, grasp and squeeze.
       Squeeze is the target of the finger drives.
     * `closing/hand` and `closing/object`: the simulated closing, on the timeline `time` [s].
     * `closing/forces`: the forces on the object as arrows, 1 cm for each newton.
 
-    `force/FINGER` is the curve of a fingertip's force [N]. A run without a closing or a mesh has no
-    `closing` and no `force`.
+    Three entities are outside it. `force/FINGER` is the curve of a fingertip's force [N]. The texts
+    `postures` and `moments` name the postures, and the key moments of the closing.
+
+    A run without an executable grasp has no `contacts`, `plan` and `postures`. A run without a
+    closing or a mesh has no `closing`, `force` and `moments`.
 
     Args:
         path: the file to write, FILE.rrd.
@@ -54,7 +58,8 @@ def write_recording(path: Path | str, run: Run) -> Path:
 
     Raises:
         MissingExtra: Rerun (extra `rerun`) is not installed.
-        BadArgument: the executable grasps do not touch the run's mesh.
+        BadArgument: the run has a closing, and its executable grasps do not touch its mesh.
+        BadArgument: the table of the run is above most points of its cloud.
         OutputError: the file cannot be written.
 
     >>> write_recording("run.rrd", run)  # doctest: +SKIP

@@ -59,7 +59,7 @@ class Run:
         explanation: why no grasp is executable, and what would help; None if it is not asked for.
         costs: sentences on what lowers the predicted success of the best grasp most, such as those
             of `explain_success`.
-        look: where a second view would help; None if no second view is needed.
+        look: where a second view would help (`next_view`); None if no second view is needed.
         command: the command line of the run, or "".
         date: date and time of the run as text, or "".
     """
@@ -102,10 +102,12 @@ class Run:
     def upright(self) -> "Run":
         """Return the run in a frame whose z axis points up.
 
-        z is the normal of the table, and the table has the height z = 0. Without a table, z points
-        to the camera. `spec` is not transformed: its table stays in the frame of the old cloud.
+        z is the normal of the table in `spec`, and the table has the height z = 0. Without a table,
+        z points to the camera. Without both, it points where the points spread least. `spec` is not
+        transformed: its table stays in the frame of the old cloud.
 
-        Raises `BadArgument` if the executable grasps do not touch the mesh.
+        Raises `BadArgument` if the executable grasps do not touch the mesh. It is also raised if
+        the table is above most points of the cloud.
         """
         obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
         upright_from_obj = inverse(obj_from_upright)

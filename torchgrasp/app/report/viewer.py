@@ -125,7 +125,7 @@ def show_grasps(
         browser: whether the page is opened; False only writes it.
 
     Raises `BadArgument` for a cloud that the grasps do not touch, and for a hand other than that of
-    the grasps.
+    the grasps. Without `hand` it is also raised if the grasps name no hand.
 
     >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
