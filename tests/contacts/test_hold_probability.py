@@ -173,7 +173,7 @@ def test_drawn_surfaces_close_as_often_as_an_exact_test_says(
 
 def test_derivatives_over_drawn_surfaces_are_those_of_differences(doubtful):
     """The step is long: roots of nearly singular covariances round. No kink is near these sets."""
-    generator = torch.Generator().manual_seed(1)
+    generator = torch.Generator().manual_seed(4)
     contacts = contacts_on(doubtful, generator, 4, 3)
     step = 1e-4
 
