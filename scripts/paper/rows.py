@@ -47,6 +47,9 @@ class Plan(Value):
 class Row(Value):
     """A row of a table: its name, how grasps are planned, which come first, and how the hand closes
     and holds.
+
+    With a `risk`, grasps take part whose contacts lack force closure at the planned friction with at
+    most this probability, by the uncertain shape. Then `first="risky"` is by this probability.
     """
 
     name: str
@@ -54,6 +57,7 @@ class Row(Value):
     first: Order
     closing: ClosingMode
     holding: HoldingMode
+    risk: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +78,7 @@ class TableSpec(Value):
         grasps: grasps of each view.
         draws: lifts of each grasp, with an error of the pose each.
         starts: of the contact planner.
+        by_risk: the rows have levels of risk in place of S_thresh.
         workers: processes; the results do not depend on their number.
         seed: of every random draw.
     """
@@ -89,6 +94,7 @@ class TableSpec(Value):
     grasps: int = 2
     draws: int = 1
     starts: int = 1000
+    by_risk: bool = False
     workers: int = 1
     seed: int = 0
 

@@ -25,6 +25,9 @@ Asked = Annotated[TableSpec, tyro.conf.arg(name="")]
 THRESHOLDS = (0.03, 0.06, 0.10)
 """S_thresh of Table 6."""
 
+RISKS = (0.1, 0.3, 0.5)
+"""Levels of risk in their place: the probability that contacts lack closure at most."""
+
 PUBLISHED = {
     "0.03": "40 63 57",
     "0.06": "43 33 30",
@@ -62,6 +65,15 @@ ROWS7 = tuple(
 )
 """Rows of Table 7, on the library's default shape."""
 
+RISKY = Plan(variance=THRESHOLDS[-1])
+"""The grasps of rows by risk: those of the last threshold, on the library's default shape."""
+RISK_ROWS6 = tuple(
+    Row(f"risk {risk:g}", RISKY, "risky", "uncertainty", "force", risk) for risk in RISKS
+)
+"""Rows of Table 6 by risk."""
+RISK_ROWS7 = tuple(dataclasses.replace(row, plan=RISKY, risk=RISKS[0]) for row in ROWS7)
+"""Rows of Table 7 by risk."""
+
 
 def table6(spec: Asked) -> None:
     """Print Table 6: how often grasps hold whose contacts are less and less certain, on the paper's
@@ -72,9 +84,10 @@ def table6(spec: Asked) -> None:
     Args:
         spec: what the table is made of.
     """
-    rows = gather(run_cells(spec, ROWS6))
+    rows = gather(run_cells(spec, RISK_ROWS6 if spec.by_risk else ROWS6))
     numbers = report(rows)
-    fall = contrast_over([count_held(row) for row in rows], line_weights(THRESHOLDS))
+    places = RISKS if spec.by_risk else THRESHOLDS
+    fall = contrast_over([count_held(row) for row in rows], line_weights(places))
     found = "excludes zero" if fall.low > 0 or fall.high < 0 else "does not exclude zero"
     print(
         f"fall of the line from the first to the last: {format_points(fall)}; the interval {found}"
@@ -91,7 +104,7 @@ def table7(spec: Asked) -> None:
     Args:
         spec: what the table is made of.
     """
-    rows = gather(run_cells(spec, ROWS7))
+    rows = gather(run_cells(spec, RISK_ROWS7 if spec.by_risk else ROWS7))
     numbers = report(rows)
     held = {row[0].row: count_held(row) for row in rows}
     alike = [f"{closing}, {FORCE}" for closing in OWN]

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from paper.rows import Cell, Lift, Order, Plan, Row, Subject, Support, TableSpec
-from torchgrasp import close_hand, load_grasps, plan_grasps
+from torchgrasp import close_hand, hold_probability, load_grasps, plan_grasps
 from torchgrasp.control.reference import check_single
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.files import format_json, write_file
-from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.foundation.errors import BadArgument, GraspError, Status
 from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -182,7 +182,15 @@ class _Bench:
                 refused += 1
                 notes.append(kept["note"])
                 continue
-            grasps = in_order(grasps, row.first)[: self.spec.grasps]
+            if row.risk is None:
+                grasps = in_order(grasps, row.first)
+            else:
+                grasps = self.below_risk(grasps, view, row.plan, row.risk)
+            if not len(grasps):
+                refused += 1
+                notes.append(f"no grasp has a risk of at most {row.risk:g}")
+                continue
+            grasps = grasps[: self.spec.grasps]
             stds += grasps.contacts.std_m.amax(1).tolist()
             lifts += [
                 self.lift(row, grasps[rank], view, rank, draw)
@@ -226,17 +234,40 @@ class _Bench:
 
     def _plan(self, view: str, plan: Plan) -> Grasps:
         """Plan on a view."""
-        cloud = self.views[view]
-        seed = self.spec.seed
-        if (view, plan.support) not in self.shapes:
-            self.shapes[view, plan.support] = fit_shape(
-                cloud, support=plan.support, seed=seed, table=0.0
-            )
-        shape = self.shapes[view, plan.support]
         grasps = plan_grasps(
-            cloud, self.hand, plan.contacts(), self.spec.starts, seed, mode=plan.mode, shape=shape
+            self.views[view],
+            self.hand,
+            plan.contacts(),
+            self.spec.starts,
+            self.spec.seed,
+            mode=plan.mode,
+            shape=self.shape(view, plan.support),
         )
         return grasps[grasps.status == Status.OK]
+
+    def shape(self, view: str, support: Support) -> ShapeGP:
+        """Return the shape of a view."""
+        if (view, support) not in self.shapes:
+            self.shapes[view, support] = fit_shape(
+                self.views[view], support=support, seed=self.spec.seed, table=0.0
+            )
+        return self.shapes[view, support]
+
+    def below_risk(self, grasps: Grasps, view: str, plan: Plan, risk: float) -> Grasps:
+        """Return the grasps that lack closure with a probability of at most `risk`, the riskiest
+        ones first. A contact at the edge of the shape's domain counts as a risk of 1.
+        """
+        friction = plan.contacts().planned_friction
+        shape = self.shape(view, plan.support)
+        held = list[float]()
+        for row in range(len(grasps)):
+            try:
+                held.append(float(hold_probability(grasps.contacts[[row]], friction, shape=shape)))
+            except BadArgument:
+                held.append(0.0)
+        lacks = 1 - torch.tensor(held)
+        order = lacks.argsort(descending=True, stable=True)
+        return grasps[order[lacks[order] <= risk]]
 
     def lift(self, row: Row, grasp: Grasps, view: str, rank: int, draw: int) -> Lift:
         """Close the hand on the true object, somewhere beside where it was seen, and lift it."""

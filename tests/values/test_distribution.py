@@ -43,6 +43,14 @@ def test_mixtures_of_intervals_are_those_of_scipy(found, parts, weights):
     )
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("found", "parts", "weights"), MIXED)
+def test_the_ends_of_a_distribution_are_its_quantiles_0_and_1(found, parts, weights, dtype):
+    ends = found.quantile(torch.tensor([0.0, 1.0], dtype=dtype))
+    wanted = min(part.ppf(0.0) for part in parts), max(part.ppf(1.0) for part in parts)
+    np.testing.assert_allclose(ends, wanted, atol=1e-6)
+
+
 @pytest.mark.parametrize(("low", "high"), [(0.35, 0.65), (0.65, np.inf), (-np.inf, 1.0)])
 @pytest.mark.parametrize(("found", "parts", "weights"), MIXED)
 def test_what_is_left_of_a_distribution_is_that_of_its_draws(found, parts, weights, low, high):

@@ -46,7 +46,7 @@ class CriticalNumbers:
     """Greatest friction coefficient; contacts that need more count as unable to balance."""
     exact: float = 1e-6
     """The last nu: the result is larger than the critical friction by about 2 nu a contact."""
-    steps: int = 60
+    steps: int = 40
     """Most steps; most contact sets need fewer than 15."""
     first: float = 1.5
     """The first friction coefficient, as a multiple of what the first forces need."""
@@ -58,14 +58,18 @@ class CriticalNumbers:
     """Share of the way to the edge of the cones that a step goes at most."""
     shorter: tuple[float, ...] = (1.0, 0.8, 0.5, 0.2, 0.05)
     """Shares of a step that are tried, since the product mu a_i is not linear."""
-    power: float = 1.5
+    power: float = 0.6
     """Exponent of the part of nu that the next step keeps; the base is what a step to nu = 0 leaves
     undone.
     """
     short: float = 0.3
-    """A step with a lesser share is short: the next one keeps mu, and `kept` of nu."""
-    kept: float = 0.5
-    """Share of nu that is kept after a short step."""
+    """A step with a lesser share is short: the next one keeps mu and nu."""
+    stuck: float = 0.05
+    """If a step that keeps mu has a lesser share, mu is too small for any balanced forces."""
+    raised: float = 1.5
+    """Factor by which mu then grows, so that steps come free of the cones' edges."""
+    off: float = 0.1
+    """Largest error of sum a_i s_i0 after the last step: it and the balance are not linear."""
     polishing: int = 2
     """Number of whole steps at the end, which leave nothing but rounding."""
     rounding: float = 1e-6
@@ -260,7 +264,6 @@ def _search(
     whole = points.new_ones(len(left))
     shorter = whole.new_tensor(numbers.shorter)
     last = whole
-    aimed = whole
     found_rows = list[Tensor]()
     found = list[LeastBalance]()
     for _ in range(numbers.steps):
@@ -268,7 +271,7 @@ def _search(
         still, centring = cones.directions(at, held)
         mean = cones.products(at).mean(1)
         undone = (1 - cones.longest(at, still)).clamp(0, 1)
-        kept = torch.where(held, numbers.kept, undone**numbers.power)
+        kept = torch.where(held, 1.0, undone**numbers.power)
         target = (kept * mean).clamp_min(numbers.exact)
         change = still.plus(centring, target)
         share = (numbers.within * cones.longest(at, change)).clamp_max(1)
@@ -276,9 +279,11 @@ def _search(
         inside = cones.inside(at, change, tried)
         share = tried.gather(1, inside.double().argmax(1, keepdim=True))[:, 0]
         at = at.plus(change, share)
-        settled = (share == 1) & (last == 1) & (target == numbers.exact) & (aimed == numbers.exact)
+        stuck = held & (share < numbers.stuck)
+        at = at._replace(friction=torch.where(stuck, numbers.raised, 1.0) * at.friction)
+        off = ((cones.split(at.forces)[0] * at.press).sum(1) - 1).abs()
+        settled = (share == 1) & (target == numbers.exact) & (off <= numbers.off)
         last = share
-        aimed = target
         lost = ~(at.friction < 2 * numbers.most)
         going = flatnonzero(~(settled | lost))
         if len(going) == len(last):
@@ -290,7 +295,6 @@ def _search(
         at = at.rows(going)
         cones = _Cones(*(x[going] for x in cones))
         last = last[going]
-        aimed = aimed[going]
         if len(left) == 0:
             break
     found_rows.append(left[:0])
@@ -382,10 +386,14 @@ class _Cones(NamedTuple):
         return good.all(-1) & (friction > 0)
 
     def nearer(self, at: LeastBalance) -> LeastBalance:
-        """Return the balance after a whole step to the last nu."""
+        """Return the balance after a whole step to the last nu, or the same one if the step would
+        leave a cone, as on a kink.
+        """
         still, centring = self.directions(at)
         whole = torch.ones_like(at.friction)
-        return at.plus(still, whole).plus(centring, CRITICAL.exact * whole)
+        change = still.plus(centring, CRITICAL.exact * whole)
+        stays = self.inside(at, change, whole[:, None])[:, 0] & (self.longest(at, change) > 1)
+        return at.plus(change, stays.to(whole))
 
     def refined(self, at: LeastBalance) -> LeastBalance:
         """Return the balance after a whole step to the last nu, without elimination of unknowns.

@@ -14,17 +14,24 @@ mass by the share e and of the centre by d changes mu_c by
 
     e y . w + (w_f x y / r) . d,    w_f the force of w.
 
-An interval of masses is split into ranges, each of which counts as a Gaussian error. So Gaussian
-errors make mu_c Gaussian, with a standard deviation s. Then the friction m suffices with the
-probability Phi((m - mu_c) / s), whose mean for m in an interval [a, b] is
+An interval of masses is split into ranges, each of which counts as a Gaussian error. So small
+Gaussian errors make mu_c Gaussian, with a standard deviation s. Then the friction m suffices with
+the probability Phi((m - mu_c) / s), whose mean for m in an interval [a, b] is
 
     s (Psi((b - mu_c) / s) - Psi((a - mu_c) / s)) / (b - a),    Psi(x) = x Phi(x) + Phi'(x).
+
+Planned contacts are near kinks of mu_c, where first order is good for small errors alone. So the
+errors e are a mixture: e = e_k + h e', with h e' small, and k one of a fixed set of points e_k that
+are spread as sqrt(1 - h^2) e. First order counts around each point, and the result is the mean.
 """
 
 import dataclasses
+import functools
 import math
+import statistics
 from typing import Annotated
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -36,10 +43,10 @@ from torchgrasp.contacts.form_closure import Vectors, centre_and_radius, with_to
 from torchgrasp.foundation.base import Value, at_once, in_chunks
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import Force, Length, Range, Seed, is_known
+from torchgrasp.foundation.rules import LEAST, Force, Length, Range, Seed, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import real
-from torchgrasp.geometry.linalg import dot, eye_like, norm
+from torchgrasp.geometry.linalg import dot, eye_like, norm, unit
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values.distribution import Distribution, check_within
 from torchgrasp.values.planning import Contacts
@@ -53,6 +60,14 @@ TILTS = Range(0.0, math.pi)
 class HoldProbabilityNumbers:
     """Parameters of `hold_probability`."""
 
+    points: int = 32
+    """Number of errors around which the critical friction is found and linearised."""
+    local: float = 0.25
+    """Standard deviation of the errors around each of them, as a share of the whole one: where the
+    critical friction has a kink, the result is too high by about as much.
+    """
+    rows: int = 2**15
+    """Contact sets with errors that are computed at a time."""
     narrow: float = 1e-4
     """An interval shorter than this, in standard deviations, counts as its middle: the difference
     of Psi would be lost in rounding.
@@ -124,11 +139,10 @@ def hold_probability(
     random surfaces.
 
     If only the friction is uncertain, the result is exact: the probability that the friction
-    exceeds the `critical_friction`, and 0 where that is infinite. Other errors count to first
-    order. So the result is mostly a little too high, since errors also raise the mean of the
-    critical friction. Errors count too little where the critical friction has a kink, as for
-    contacts that are exactly symmetric. The result is 0 for the few sets for which the method does
-    not converge; most of them carry a load far below the normal forces.
+    exceeds the `critical_friction`, and 0 where that is infinite. The other errors count by the
+    mean over a fixed set of 32 errors. Around each of these, smaller errors count to first order.
+    The result is 0 for the few sets for which the method does not converge; most of them carry a
+    load far below the normal forces.
 
     Args:
         contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals.
@@ -144,8 +158,8 @@ def hold_probability(
         weight: the weight that the contacts carry. None means that they must resist any load, and
             that the fingertips press as much as it needs.
         shape: the uncertain shape in the frame of the contacts. Random surfaces are drawn from it
-            as in `closure_probability`; the other errors count on each of them. None means that the
-            planned contacts lie on the true surface.
+            as in `closure_probability`; each of them has one of as many other errors. None means
+            that the planned contacts lie on the true surface.
         draws: number of random surfaces, if there is a `shape`.
         seed: random seed of the surfaces.
 
@@ -168,58 +182,109 @@ def hold_probability(
     points = check_contacts(contacts).points.double()
     normals = check_unit(contacts.normals.double())
     check_within("friction", friction, FRICTIONS)
-    spread = _Errors(placement, _tilts(tilt, points), shift, turn)
     center = points.new_zeros(len(points), 3)
+    apart = 0.0
     if weight is not None:
         center = _center(weight, points)
-    count = 1
+        apart = weight.center_std
+    errors = _Errors(placement, _tilts(tilt, points)[:, None], shift, turn, apart)
+    points, normals, center = (x[:, None] for x in (points, normals, center))
+    certain = not isinstance(tilt, Tensor) and placement == tilt == shift == turn == apart == 0
+    count = 1 if certain else HOLD.points
     missed = None
     if shape is not None:
         count = draws
         touched, slopes = drawn_contacts(line_posterior(shape, contacts), draws, seed)
-        touched = shape.metres(touched.flatten(0, 1)).to(points)  # (b n, f, 3)
-        slopes = slopes.flatten(0, 1).to(points)
+        touched = shape.metres(touched).to(points)  # (b, n, f, 3)
         # where a finger meets no surface, the planned contacts stand in, and the result is 0
-        missed = ~torch.isfinite(touched).flatten(1).all(1)
-        each = missed[:, None, None]
-        points = torch.where(each, points.repeat_interleave(draws, 0), touched)
-        normals = torch.where(each, normals.repeat_interleave(draws, 0), slopes)
-        tilts = spread.tilt.repeat_interleave(draws, 0)
-        spread = dataclasses.replace(spread, tilt=tilts)
-        center = center.repeat_interleave(draws, 0)
+        missed = ~torch.isfinite(touched).flatten(2).all(2)
+        each = missed[..., None, None]
+        points = torch.where(each, points, touched)
+        normals = torch.where(each, normals, slopes.to(points))
+    if not certain:
+        points, normals, center = errors.displaced(points, normals, center, count)
+        errors = errors.times(HOLD.local)
+    points, normals, center, tilts = (
+        x.expand(-1, count, *x.shape[2:]).flatten(0, 1)
+        for x in (points, normals, center, errors.tilt)
+    )
+    errors = dataclasses.replace(errors, tilt=tilts)
     law = Distribution.of(friction)
     if weight is None:
-        found = _held(law, points, normals, spread)
+        found = _held(law, points, normals, errors)
     else:
         found = points.new_zeros(len(points))
         for mass, width, share in _mass_ranges(Distribution.of(weight.mass)):
-            burden = _Burden(_force(weight, mass, points), center, width / mass, weight.center_std)
-            found = found + share * _held(law, points, normals, spread, burden)
+            burden = _Burden(_force(weight, mass, points), center, width / mass)
+            found = found + share * _held(law, points, normals, errors, burden)
+    found = found.unflatten(0, (-1, count))
     if missed is not None:
         found = torch.where(missed, 0.0, found)
-    return found.unflatten(0, (-1, count)).mean(1).to(contacts.points)
+    return found.mean(1).to(contacts.points)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Errors:
-    """Standard deviations of placement [m], normals [rad] (b, f), position [m] and rotation [rad]."""
+    """Standard deviations of placement [m], normals [rad], position [m] and rotation [rad], and of
+    the centre of mass [m].
+    """
 
     placement: float
-    tilt: Float[Tensor, "b f"]
+    tilt: Float[Tensor, "*b f"]
     shift: float
     turn: float
+    center: float
+
+    def times(self, share: float) -> "_Errors":
+        """Return a share of the errors."""
+        others = (share * x for x in (self.shift, self.turn, self.center))
+        return _Errors(share * self.placement, share * self.tilt, *others)
+
+    def displaced(
+        self,
+        points: Float[Tensor, "b _ f 3"],
+        normals: Float[Tensor, "b _ f 3"],
+        center: Float[Tensor, "b _ 3"],
+        count: int,
+    ) -> tuple[Float[Tensor, "b n f 3"], Float[Tensor, "b n f 3"], Float[Tensor, "b n 3"]]:
+        """Return contacts and centres of mass under n = `count` errors, which are those of all
+        contact sets.
+        """
+        f = points.shape[2]
+        away = real(_spread_evenly(count, 6 * f + 9)).to(points).unflatten(1, (-1, 3))
+        placed, tilted, (moved, turned, apart) = away[:, :f], away[:, f:-3], away[:, -3:].unbind(1)
+        points = points.expand(-1, count, f, 3)
+        arms = points - points.mean(2, keepdim=True)
+        motion = self.placement * placed + self.shift * moved[:, None]
+        motion = motion + self.turn * torch.linalg.cross(turned[:, None].expand_as(arms), arms)
+        tilted = self.tilt[..., None] * tilted
+        motion, tilted = (x - dot(x, normals, keepdim=True) * normals for x in (motion, tilted))
+        return points + motion, unit(normals + tilted), center + self.center * apart
+
+
+@functools.lru_cache(maxsize=16)
+def _spread_evenly(count: int, numbers: int) -> list[list[float]]:
+    """Return a fixed set of `count` errors, each of some normal numbers: every number takes each of
+    `count` equally likely values once (Latin hypercube sampling).
+
+    What is left to the errors around them is not in it.
+    """
+    normal = statistics.NormalDist()
+    values = np.array([normal.inv_cdf((k + 0.5) / count) for k in range(count)])
+    size = math.sqrt(1 - HOLD.local**2) / max(values.std(), LEAST)
+    orders = np.tile(size * values, (numbers, 1))
+    return np.random.default_rng(0).permuted(orders, axis=1).T.tolist()
 
 
 @dataclasses.dataclass(frozen=True)
 class _Burden:
     """A weight: the force over the mean normal force, the centre of mass [m] of each contact set,
-    the standard deviation of the mass over the mass, and that of the centre [m].
+    and the standard deviation of the mass over the mass.
     """
 
     force: Float[Tensor, "3"]
     center: Float[Tensor, "b 3"]
     of_mass: float
-    of_center: float
 
     def wrench(self, points: Vectors) -> Float[Tensor, "b 6"]:
         """Return the load of `least_balance`."""
@@ -256,7 +321,7 @@ def _held(
         push = burden.force.expand_as(balance.twist[:, 3:])
         by_center = torch.linalg.cross(push, balance.twist[:, 3:]) / radius[:, 0]
         by_mass = dot(balance.twist, load[rows], keepdim=True)
-        parts += [burden.of_center * by_center, burden.of_mass * by_mass]
+        parts += [errors.center * by_center, burden.of_mass * by_mass]
     square = (torch.cat(parts, 1) ** 2).sum(1)
     # without errors the derivative of the root would be NaN
     deviation = torch.where(square > 0, square, 1.0).sqrt() * (square > 0)

@@ -15,7 +15,6 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import (
     ANY,
-    LEAST,
     Measured,
     Positive,
     Range,
@@ -262,7 +261,7 @@ class Distribution(Value):
         numbers, values = self._steps.to(q)
         values = values.contiguous()
         end = torch.searchsorted(values, q.detach().contiguous()).clamp(1, len(values) - 1)
-        rise = (values[end] - values[end - 1]).clamp_min(LEAST)
+        rise = (values[end] - values[end - 1]).clamp_min(torch.finfo(q.dtype).tiny)
         share = ((q - values[end - 1]) / rise).clamp(0, 1)
         return torch.lerp(numbers[end - 1], numbers[end], share)
 
