@@ -5,12 +5,13 @@ import torch
 import trimesh
 
 from tests.make import HALF, box, halved
+from torchgrasp import Scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane
 from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage
-from torchgrasp.scene.merge import find_touching, merge_pieces
+from torchgrasp.scene.merge import _Body, _one_body, find_touching, merge_pieces
 from torchgrasp.scene.segment import rests_on, segment
 from torchgrasp.scene.table_image import TableImage
 
@@ -143,6 +144,45 @@ def test_objects_apart_do_not_touch_and_a_convex_surface_has_no_crease():
     found = segment(TableImage.of(image, TABLE))
     assert found.max() == 2 and find_touching(image, image.points(), found) == []
     assert torch.equal(cut_creases(image, image.points(), found), found)
+
+
+def test_a_thing_that_hides_another_between_two_ends_is_not_joined_to_it_but_a_handle_is():
+    generator = torch.Generator().manual_seed(0)
+
+    def body(low, high):
+        low, high = (torch.tensor(x).double() for x in (low, high))
+        points = low + (high - low) * torch.rand(500, 3, generator=generator, dtype=torch.float64)
+        return _Body((0,), points, 500)
+
+    front = body([0.0, 0.0, 0.0], [0.05, 0.05, 0.1])
+    behind = body([0.06, -0.05, 0.0], [0.12, 0.1, 0.08])
+    handle = body([0.06, 0.02, 0.055], [0.08, 0.03, 0.09])
+    ends = 0.0  # the gap of two bodies that meet at two ends
+    assert not _one_body(front, behind, ends) and not _one_body(behind, front, ends)
+    assert _one_body(front, handle, ends) and _one_body(handle, front, ends)
+
+
+STICKS = [box([0.02, 0.16, 0.02], [0, 0, 0.01]), box([0.14, 0.02, 0.02], [0.08, 0.08, 0.01])]
+
+
+@pytest.mark.parametrize(
+    ("meshes", "told"),
+    [
+        (STICKS, True),
+        ([box([0.03, 0.22, 0.02], [0, 0, 0.01])], False),  # long, without gaps
+        ([mesh.copy().apply_scale([0.5, 0.5, 1.0]) for mesh in STICKS], False),  # with gaps, short
+    ],
+    ids=["long", "whole", "short"],
+)
+def test_a_long_object_with_gaps_in_its_outline_may_be_several_which_is_told(meshes, told):
+    pose = look_at(20.0, 50.0, 0.6)
+    depth, labels = render_depth(meshes, pose)
+    scene = Scene.from_depth(depth, INTRINSICS, pose, up=(0.0, 0.0, 1.0))
+    assert scene.things == (1,)
+    said = [line for line in scene.advice if "several objects" in line]
+    assert len(said) == told
+    given = Scene.from_depth(depth, INTRINSICS, pose, up=(0.0, 0.0, 1.0), mask=labels > 0)
+    assert not any("several objects" in line for line in given.advice)
 
 
 def test_an_uneven_place_of_the_table_is_no_object():

@@ -14,10 +14,10 @@ from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.lazy import ndimage
+from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.foundation.rules import Pose, Positive
 from torchgrasp.geometry.frames import inverse
-from torchgrasp.geometry.linalg import Points
+from torchgrasp.geometry.linalg import Points, norm
 from torchgrasp.geometry.plane import Plane, to_upright
 from torchgrasp.geometry.support_planes import Target, find_table
 from torchgrasp.scene.creases import cut_creases
@@ -40,6 +40,14 @@ class SceneNumbers:
     """Largest distance [m] of a given point from a measured one."""
     part: float = 0.1
     """Share of an object's pixels beyond a crease that may be another object."""
+    across: float = 0.19
+    """Distance [m] of an object's two farthest points from which it may be several objects: hands
+    grasp few that are longer.
+    """
+    filled: float = 0.85
+    """Greatest share of the convex hull of its pixels that such an object fills."""
+    closing: int = 2
+    """Pixels by which gaps in an object are closed before this share is measured."""
     lowest: float = 0.02
     """Share of a target's points that may be lower than its foot: outliers."""
     drawn: int = 2000
@@ -345,7 +353,8 @@ class Scene(Value):
 
         * Objects could also stand on another plane than `table`.
         * Two objects touch, so that the border between them is a guess; not if both are `given`.
-        * An object that is not `given` has a crease: it may be several objects.
+        * An object that is not `given` has a crease, or is long and has gaps in its outline: it may
+          be several objects.
         * The target is cut off at the border of the image.
         * Another object hides much of the target.
         """
@@ -371,6 +380,11 @@ class Scene(Value):
                     f"object {k} has a crease: if it is several objects, "
                     "give a mask of the one to grasp"
                 )
+            elif self._sprawls(k, labels):
+                found.append(
+                    f"object {k} is long and has gaps in its outline: if it is several objects, "
+                    "give a mask of the one to grasp"
+                )
         if self.image.at_border(self.pixels[self.rows_of()]):
             fix = "its other part is unknown; turn the camera to it"
             found.append(f"the target is cut off at the border of the image: {fix}")
@@ -378,6 +392,21 @@ class Scene(Value):
             fix = f"turn the camera, or take object {k} away first"
             found.append(f"object {k} stands before {share:.0%} of the target's outline: {fix}")
         return tuple(found)
+
+    def _sprawls(self, label: int, labels: Int[Tensor, "h w"]) -> bool:
+        """Return whether an object is long, and does not fill the convex hull of its pixels."""
+        points = self.points[self.rows_of(label)].double()
+        end = points[norm(points - points.mean(0)).argmax()]
+        other = points[norm(points - end).argmax()]
+        if float(norm(points - other).max()) < SCENE.across:
+            return False
+        closed = ndimage.binary_closing((labels == label).cpu().numpy(), iterations=SCENE.closing)
+        pixels = np.argwhere(closed)
+        try:
+            hull = spatial.ConvexHull(pixels)
+        except spatial.QhullError:  # a line of pixels has no gap
+            return False
+        return len(pixels) < SCENE.filled * float(hull.volume)
 
     def _covers(self) -> dict[int, float]:
         """Return the objects that hide much of the target: labels, and shares of its outline."""
