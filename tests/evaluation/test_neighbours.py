@@ -9,7 +9,7 @@ import trimesh
 
 from tests.pinch import QUICK, cylinder, pinch, quick_trial
 from torchgrasp import close_hand
-from torchgrasp.foundation.errors import MeshError, Status
+from torchgrasp.foundation.errors import BadArgument, MeshError, Status
 from torchgrasp.sim import Neighbour
 from torchgrasp.values.closing import ClosingOptions
 
@@ -115,3 +115,8 @@ def test_neighbours_weigh_what_they_are_given_and_are_checked():
     opened = trimesh.Trimesh(box((0, 0)).vertices, box((0, 0)).faces[:-1])
     with pytest.raises(MeshError, match="open surface"):
         close_hand(grasp, hand, cylinder(), neighbours=[Neighbour(opened)])
+
+
+def test_a_mass_that_is_not_positive_is_refused():
+    with pytest.raises(BadArgument, match="mass"):
+        Neighbour(box((-0.3, 0.3)), mass=-1.0)

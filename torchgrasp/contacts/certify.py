@@ -59,7 +59,8 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     friction cones, with their torques; they are the columns of W. Coefficients phi with W phi = 0
     and sum phi = 1 balance them. The margin is the largest s with phi >= s for such a phi, or -inf
     without one. A set is `closed` if its margin is at least 1e-6 (`MIN_MARGIN`) and its
-    `rank_ratio` at least 1e-3 (`MIN_RANK_RATIO`).
+    `rank_ratio` at least 1e-3 (`MIN_RANK_RATIO`). Then its contacts must not lie almost on a line,
+    and phi must balance W up to rounding.
 
     If a set is not closed, its `witness` is a unit wrench v that no contact force opposes: v . w >=
     0 for every edge wrench w, up to rounding. If only the rank is too low, the wrenches are

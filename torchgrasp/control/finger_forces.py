@@ -105,10 +105,12 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
     * `forces` (g, f, 3) [N]: balanced forces of the fingertips on the object, in the hand's frame.
     * `torques` (g, h) [N m or N]: efforts of the actuated joints that exert these forces.
 
-    The targets solve J^T f = kp (target - q). Here q are the joints of the grasp, f the forces, and
-    J the Jacobian of the contacts. If no forces that press at every contact balance, each force is
-    `force` along the inward normal. The targets are differentiable in the joints of the grasps. The
-    forces, found by a search, are not differentiable in the contacts.
+    The targets solve J^T f = K (target - q). Here q are the joints of the grasp, f the forces,
+    and J the Jacobian of the contacts. K is diagonal: each actuated joint has the `kp` of its
+    own drive and of the joints coupled to it, times their squared ratios. If no forces that
+    press at every contact balance, each force is `force` along the inward normal. The targets
+    are differentiable in the joints of the grasps. The forces, found by a search, are not
+    differentiable in the contacts.
 
     Args:
         hand: the hand of the grasps, on any device; the results are on that of the grasps.

@@ -65,9 +65,9 @@ TRIALS = TrialNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """The true world of a trial, which only the simulator knows.
+    """The true world of a trial, which only the simulator knows; `GraspTrial(truth=)` takes it.
 
-    Everything is in the frame of the grasp, in metres.
+    Everything is in the frame of the grasp, in metres. Meshes are checked when a trial runs.
 
     Args:
         mesh: closed mesh of the object [m], or its file.
@@ -77,7 +77,7 @@ class Truth:
         table: the true table below the object. None means a level table at the mesh's lowest point.
         neighbours: other bodies on the table, which the hand may push.
         slide: displacement (3,) [m] of the object along the table, halfway through the approach.
-            None means no displacement.
+            None means no displacement; without an approach there is none, too.
         camera: pose (4, 4) [m] of a depth camera (x right, y down, z forward) with which the robot
             looks again before the approach. None means no second look.
     """

@@ -36,7 +36,8 @@ def find_hand(name_or_path: str | Path) -> Path:
         name_or_path: name of a shipped hand, a folder with a hand.toml, or the path of a hand.toml.
 
     Raises `HandFileError` if there is no such hand. It is also raised for a shipped hand's name if
-    a folder of this name in the working directory holds another hand. "./NAME" means this folder.
+    another folder of this name with a hand.toml is in the working directory. "./NAME" means that
+    folder.
 
     >>> find_hand("allegro").name
     'allegro'

@@ -262,9 +262,11 @@ def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     Behind another object, a fitted model estimates the probability. Behind the target and where
     nothing was measured, it is a rough guess.
 
-    The voxels have a side of 5 mm (`OCCUPANCY.spacing`), and extend 0.25 m (`OCCUPANCY.sideways`)
-    around the target. They reach from the table to 0.04 m (`OCCUPANCY.above`) above the highest
-    point there. The probabilities are float64 on the scene's device, but computed on the CPU.
+    The voxels have a side of 5 mm (`OCCUPANCY.spacing`), and extend 0.25 m
+    (`OCCUPANCY.sideways`) around the target. They reach from the table up to 0.04 m
+    (`OCCUPANCY.above`) above the highest measured point of an object in this area. Without a
+    table they begin at the lowest one. The probabilities are float64 on the scene's device, but
+    computed on the CPU.
 
     Args:
         scene: the scene in a frame with z up, as `Scene.to_upright` returns it. Its table, if it

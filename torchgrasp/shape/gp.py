@@ -53,9 +53,10 @@ DOMAIN = DomainNumbers()
 class ShapeGP(Posterior, Normalisation):
     """An object's shape as a Gaussian process over its signed distance, Eq. (1) of the paper.
 
-    `fit_shape` and `condition` return shapes. `predict` returns distance, normal and uncertainty at
-    points [m] in the cloud's frame. Other methods take normalised points, the results of
-    `normalise`. One normalised unit of length is `scale` [m].
+    `fit_shape` and `condition` return shapes. Points of `predict`, `contains`, `joint`, `sample`,
+    `differentiate`, `update` and `widened` are in the cloud's frame [m]. Methods that take
+    normalised points say so; `normalise` returns these. One normalised unit of length is `scale`
+    [m].
 
     n counts observed points, and r observed numbers: n distances, and three for each observed
     normal.
@@ -81,9 +82,9 @@ class ShapeGP(Posterior, Normalisation):
             at all. "cut off" means that the image border cuts the object off, and "whole" that
             there is no hidden side.
 
-    Results at given points are differentiable in the points to any order. At observed points they
-    are twice differentiable, and normals of a thin plate once. `update` refuses points that require
-    a gradient.
+    Results at given points are differentiable in the points to any order, and those of `sample`
+    twice. At observed points they are twice differentiable, and normals of a thin plate once.
+    `update` refuses points that require a gradient.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> view = load_object("jug").view
@@ -115,7 +116,7 @@ class ShapeGP(Posterior, Normalisation):
         Nothing is transformed or computed anew; `condition` makes a shape of observations. The
         domain's radius is the smaller of two lengths. One is half the kernel's `diameter`. The
         other is 1.25 (`DOMAIN.reach`) times the greatest distance of an observed point from the
-        centre.
+        centre. The shape's `kind` is "guess".
 
         Args:
             posterior: another shape, of which the fields `x`, `has_normal`, `weights`, `factor`,

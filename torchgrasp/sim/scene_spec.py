@@ -14,6 +14,7 @@ from torchgrasp.files import render
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import Positive
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Urdf, read_urdf
 
@@ -57,11 +58,13 @@ class Neighbour:
         parts: convex parts of the mesh [m]; None means those that `convex_parts` computes.
         mass: mass [kg]. None means that `TrialSpec.mass` or `TrialSpec.density` gives it, as for
             the object.
+
+    Raises `BadArgument` for a mass that is not positive.
     """
 
     mesh: "trimesh.Trimesh"
     parts: "Sequence[trimesh.Trimesh] | None" = None
-    mass: float | None = None
+    mass: Positive | None = None
 
 
 @checked
@@ -73,11 +76,13 @@ class Body:
         mesh: closed mesh [m] of the body, in the world's frame at its initial pose.
         parts: convex parts [m] whose union approximates the mesh, as `convex_parts` returns them.
         mass: mass [kg] of the body.
+
+    Raises `BadArgument` for a mass that is not positive.
     """
 
     mesh: "trimesh.Trimesh"
     parts: "Sequence[trimesh.Trimesh]"
-    mass: float
+    mass: Positive
 
     @property
     def inertia(self) -> np.ndarray:
