@@ -93,8 +93,8 @@ class TargetTry:
 
     `purity` is the share of the pixels taken for the target that are its own, and `share` the share
     of its own measured pixels that are taken. Without a grasp, `said` is the reason, and `clear`
-    counts the neighbours to take away first. A refused target has pixels and prediction 0.
-    `moved` [m] is the largest motion of a neighbour.
+    counts the neighbours to take away first. `doubted` tells whether advice names the target. A
+    refused target has pixels and prediction 0. `moved` [m] is the largest motion of a neighbour.
     """
 
     scene: int
@@ -110,6 +110,7 @@ class TargetTry:
     moved: float = 0.0
     said: str = ""
     clear: int = 0
+    doubted: bool = False
 
     @property
     def held(self) -> bool:
@@ -132,7 +133,7 @@ def target(o: Options) -> list[Row]:
     for outcomes in run_tasks(try_scene, tasks, o.workers, LIMIT):
         if isinstance(outcomes, Status):
             raise SystemExit(f"target: a scene ended with {outcomes.name}")
-        tries = [TargetTry(**outcome) for outcome in outcomes]
+        tries = [read_try(outcome) for outcome in outcomes]
         print(*tries, sep="\n", flush=True)
         found += tries
     return [row for way in WAYS for row in describe(way, [x for x in found if x.way == way])]
@@ -142,6 +143,12 @@ def try_scene(o: Options, k: int, hand: str) -> list[dict[str, Any]]:
     """Return the fields of the tries of one scene; kept ones are read."""
     path = o.out / "target" / f"{hand}_{o.starts}_{o.simulator}_{k:03d}.json"
     return keep(path, lambda: [dataclasses.asdict(x) for x in _try_scene(o, k, hand)])
+
+
+def read_try(outcome: dict[str, Any]) -> TargetTry:
+    """Return a try from a file, in which a success that is unknown is null."""
+    predicted = math.nan if outcome["predicted"] is None else outcome["predicted"]
+    return TargetTry(**outcome | {"predicted": predicted})
 
 
 def _try_scene(o: Options, k: int, hand: str) -> list[TargetTry]:
@@ -236,12 +243,15 @@ def try_target(clutter: Clutter, k: int, way: str, hand: str, o: Options) -> Tar
         plan = plan_scene(scene, model, spec, o.starts, o.seed, target=scene.target, task=task)
     except GraspError as error:
         return dataclasses.replace(told, said=str(error))
+    names = ("the target", f"object {scene.target} ", f"and {scene.target} touch")
+    doubted = any(name in line for line in scene.advice for name in names)
     taken = scene.pixel_labels == scene.target
     both = int((taken & own).sum())
     told = dataclasses.replace(
         told,
         purity=both / max(int(taken.sum()), 1),
         share=both / int((own & (clutter.depth > 0)).sum()),
+        doubted=doubted,
     )
     return lift_target(clutter, plan, told, hand, trial, k)
 
@@ -293,6 +303,7 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
     planned = [x for x in tries if x.status != "NO_GRASP"]
     held = share_over(count_by((x.family, x.held) for x in tries))
     good = share_over(count_by((x.family, x.held or x.asked) for x in tries))
+    wary = share_over(count_by((x.family, x.held or x.asked or x.doubted) for x in tries))
     of_planned = share_over(count_by((x.family, x.held) for x in planned))
     pushed = share_over(count_by((x.family, x.moved > MOVED) for x in planned))
     error = mean_over((x.family, x.predicted - x.held) for x in planned)
@@ -303,7 +314,8 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
     bar = BARS[way]
     asking = way == "click"
     first = good if asking else held
-    words = f"held {format_share(held, 'scenes')}; held or asked {format_share(good, 'scenes')}"
+    words = f"held {format_share(held, 'scenes')}; held or asked {format_share(good, 'scenes')}; "
+    words += f"held, asked or told in the scene's advice {format_share(wary, 'scenes')}"
     whole = sum(x.share >= KEPT for x in tries)
     pure = sum(x.purity >= KEPT for x in tries)
     kept = f"{whole} of {len(tries)} keep {KEPT:.0%} of the target's measured pixels; "
@@ -339,6 +351,7 @@ def describe_group(tries: Sequence[TargetTry]) -> str:
     if not tries:
         return "none"
     words = f"{sum(x.held for x in tries)} held, {len(tries) - len(planned)} without a grasp of {len(tries)}"
-    if planned:
-        words += f", predicted {np.mean([x.predicted for x in planned]):.2f}"
+    known = [x.predicted for x in planned if not math.isnan(x.predicted)]
+    if known:
+        words += f", predicted {np.mean(known):.2f}"
     return words
