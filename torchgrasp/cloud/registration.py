@@ -31,7 +31,7 @@ from torchgrasp.values.planning import PointCloud
 
 
 @dataclasses.dataclass(frozen=True)
-class AgreementNumbers:
+class ViewDistanceNumbers:
     """Bounds on how far the views of one object may be apart."""
 
     drawn: int = 400
@@ -96,7 +96,7 @@ class RegistrationNumbers:
     """Greatest rotation [deg] that is corrected: normals are to match."""
 
 
-VIEWS = AgreementNumbers()
+VIEWS = ViewDistanceNumbers()
 MOTION = RegistrationNumbers()
 
 
