@@ -314,8 +314,8 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
     bar = BARS[way]
     asking = way == "click"
     first = good if asking else held
-    words = f"held {format_share(held, 'scenes')}; held or asked {format_share(good, 'scenes')}; "
-    words += f"held, asked or told in the scene's advice {format_share(wary, 'scenes')}"
+    words = f"held {format_share(held)}; held or asked {format_share(good)}; "
+    words += f"held, asked or told in the scene's advice {format_share(wary)}"
     whole = sum(x.share >= KEPT for x in tries)
     pure = sum(x.purity >= KEPT for x in tries)
     kept = f"{whole} of {len(tries)} keep {KEPT:.0%} of the target's measured pixels; "
@@ -324,7 +324,7 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
         Row(
             f"target by {way}",
             f">= {bar:.0%} held" + (" or asked" if asking else ""),
-            f"{words}; held of planned {format_share(of_planned, 'scenes')}",
+            f"{words}; held of planned {format_share(of_planned)}",
             first.value >= bar,
             {"tries": [dataclasses.asdict(x) for x in tries]},
         ),
