@@ -164,6 +164,21 @@ def test_the_success_of_a_good_grasp_of_a_whole_box_is_known():
     assert not is_unknown(see(BOX))
 
 
+@pytest.mark.parametrize("aside", [0.03, 0.2])
+def test_success_is_unknown_for_a_target_much_of_which_another_object_hides(aside):
+    target = trimesh.creation.box([0.06, 0.06, 0.12]).apply_translation([0.0, 0.0, 0.06])
+    front = trimesh.creation.box([0.05, 0.05, 0.14]).apply_translation([0.12, aside, 0.07])
+    camera = look_at(0.0, 30.0, 0.7)
+    depth, labels = render_depth([target, front], camera)
+    scene = Scene.from_depth(halved(depth), HALF, camera, labels=halved(labels), table=0.0)
+    objects = pose_request(Request(scene.select(1), HAND), HAND)
+    grasps = load_shipped_grasp("jug", "allegro")
+    (ranked,) = rank(objects, grasps, torch.zeros_like(grasps.status))
+    hidden = aside < 0.1
+    assert bool(scene.select(1).covers) == hidden
+    assert bool(ranked.known.any()) != hidden
+
+
 def test_a_heap_of_specks_costs_no_planning(monkeypatch):
     scene = see(BOX, half=False)  # of each speck some pixels are drawn
     tile = scene.pixels // 8

@@ -79,8 +79,9 @@ class ShapedObject:
     `cloud` and `scene` are what was seen. `cloud` and `table` (a plane, or a height [m] along z)
     are in the caller's frame, all else in the upright frame. `obj_from_upright` [m] is the
     transform from the upright frame to the caller's. `shape` is the estimated shape, `surface` its
-    mesh [m], and `body` the estimates from which success is predicted. `vague` says that the cloud
-    hardly shows the object: few points, one plane, or a part beyond the image border. `obstacles`
+    mesh [m], and `body` the estimates from which success is predicted. `vague` says that the
+    camera hardly saw the object: few points, one plane, a part beyond the image border, or much of
+    it behind another object. `obstacles`
     surround a scene's target; None without a scene.
     """
 
@@ -124,13 +125,13 @@ class ShapedObject:
         body = EstimatedBody.around(shape, surface.vertices, field)
         # the surroundings of a scene's target
         obstacles = None
+        vague = is_vague_cloud(cloud)
         if scene is not None:
+            vague = vague or bool(scene.covers)
             scene = scene.to_upright(frame)
             if scene.target is not None:
                 obstacles = Obstacles.of(estimate_occupancy(scene, scene.target))
-        return cls(
-            cloud, scene, spec.table, frame, shape, surface, body, is_vague_cloud(cloud), obstacles
-        )
+        return cls(cloud, scene, spec.table, frame, shape, surface, body, vague, obstacles)
 
 
 @dataclasses.dataclass(frozen=True)

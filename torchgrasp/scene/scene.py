@@ -41,13 +41,13 @@ class SceneNumbers:
     part: float = 0.1
     """Share of an object's pixels beyond a crease that may be another object."""
     across: float = 0.19
-    """Distance [m] of an object's two farthest points from which it may be several objects: hands
+    """Distance [m] of a target's two farthest points from which it may be several objects: hands
     grasp few that are longer.
     """
     filled: float = 0.85
-    """Greatest share of the convex hull of its pixels that such an object fills."""
+    """Greatest share of the convex hull of its pixels that such a target fills."""
     closing: int = 2
-    """Pixels by which gaps in an object are closed before this share is measured."""
+    """Pixels by which gaps in a target are closed before this share is measured."""
     lowest: float = 0.02
     """Share of a target's points that may be lower than its foot: outliers."""
     drawn: int = 2000
@@ -353,8 +353,8 @@ class Scene(Value):
 
         * Objects could also stand on another plane than `table`.
         * Two objects touch, so that the border between them is a guess; not if both are `given`.
-        * An object that is not `given` has a crease, or is long and has gaps in its outline: it may
-          be several objects.
+        * An object that is not `given` has a crease: it may be several objects.
+        * The target is not `given`, is long, and has gaps in its outline: it may be several, too.
         * The target is cut off at the border of the image.
         * Another object hides much of the target.
         """
@@ -380,27 +380,29 @@ class Scene(Value):
                     f"object {k} has a crease: if it is several objects, "
                     "give a mask of the one to grasp"
                 )
-            elif self._sprawls(k, labels):
+            elif k == self.target and self._sprawls(labels):
                 found.append(
-                    f"object {k} is long and has gaps in its outline: if it is several objects, "
+                    "the target is long and has gaps in its outline: if it is several objects, "
                     "give a mask of the one to grasp"
                 )
         if self.image.at_border(self.pixels[self.rows_of()]):
             fix = "its other part is unknown; turn the camera to it"
             found.append(f"the target is cut off at the border of the image: {fix}")
-        for k, share in self._covers().items():
+        for k, share in self.covers.items():
             fix = f"turn the camera, or take object {k} away first"
             found.append(f"object {k} stands before {share:.0%} of the target's outline: {fix}")
         return tuple(found)
 
-    def _sprawls(self, label: int, labels: Int[Tensor, "h w"]) -> bool:
-        """Return whether an object is long, and does not fill the convex hull of its pixels."""
-        points = self.points[self.rows_of(label)].double()
+    def _sprawls(self, labels: Int[Tensor, "h w"]) -> bool:
+        """Return whether the target is long, and does not fill the convex hull of its pixels."""
+        points = self.points[self.rows_of()].double()
         end = points[norm(points - points.mean(0)).argmax()]
         other = points[norm(points - end).argmax()]
         if float(norm(points - other).max()) < SCENE.across:
             return False
-        closed = ndimage.binary_closing((labels == label).cpu().numpy(), iterations=SCENE.closing)
+        closed = ndimage.binary_closing(
+            (labels == self.target).cpu().numpy(), iterations=SCENE.closing
+        )
         pixels = np.argwhere(closed)
         try:
             hull = spatial.ConvexHull(pixels)
@@ -408,8 +410,13 @@ class Scene(Value):
             return False
         return len(pixels) < SCENE.filled * float(hull.volume)
 
-    def _covers(self) -> dict[int, float]:
-        """Return the objects that hide much of the target: labels, and shares of its outline."""
+    @property
+    def covers(self) -> dict[int, float]:
+        """The objects that hide much of the target, by label: the share of its outline before which
+        each of them stands.
+
+        Only shares above a fifth (`SCENE.covered`) are listed. Without a target there are none.
+        """
         labels = self.pixel_labels.cpu()
         depth = self.image.depth.cpu().double()
         own = labels == (self.target or 0)
