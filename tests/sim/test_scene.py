@@ -229,6 +229,15 @@ def test_open_scene_refuses_joints_without_a_drive(simulator):
 
 
 @simulated
+def test_a_mount_without_an_approach_or_room_to_yield_refuses_both(simulator):
+    *_, scene = build("barrett", standing(), simulator)
+    with pytest.raises(BadArgument, match="no joint torchgrasp_approach"):
+        scene.approach(0.05)
+    with pytest.raises(BadArgument, match="no joint torchgrasp_shift_x"):
+        scene.shift(np.zeros(3))
+
+
+@simulated
 def test_yielding_mount_shifts_and_lifts_the_hand(simulator):
     *_, world_from_hand, scene = build("barrett", standing(), simulator, yields=0.02)
     scene.shift(np.array([0.02, -0.01, 0.005]))

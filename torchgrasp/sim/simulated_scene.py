@@ -225,33 +225,32 @@ class SimulatedScene(abc.ABC):
             speed: speed [m/s] at which the target itself moves. 0 means that the mount comes to
                 rest at `height`.
         """
-        self._move_mount(LIFT_JOINT, height, speed)
+        self._drive_mount(LIFT_JOINT, height, speed)
 
     @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
         """Set the target of the approach along `SceneSpec.approach`, until the next call.
 
-        Only for a scene whose `SceneSpec.approach` is not zero.
+        Raises `BadArgument` for a scene whose `SceneSpec.approach` is zero.
 
         Args:
             left: target distance [m] that is left to the end of the approach.
             speed: speed [m/s] at which the target itself moves forward; negative backward. 0 means
                 that the mount comes to rest at `left`.
         """
-        self._move_mount(APPROACH_JOINT, -left, speed)
+        self._drive_mount(APPROACH_JOINT, -left, speed)
 
     @checked
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
         """Set the target of the mount's displacement beside approach and lift, until the next call.
-
-        Only for a scene whose `SceneSpec.yields` is above 0.
 
         Args:
             displacement: target displacement (3,) [m] in the world's frame.
             velocity: velocity (3,) [m/s] in the world's frame at which the target itself moves. 0
                 means that the mount comes to rest at `displacement`.
 
-        Raises `BadArgument` for arrays of another shape, or without numbers.
+        Raises `BadArgument` for arrays of another shape, or without numbers, and for a scene whose
+        `SceneSpec.yields` is 0.
         """
         for name, vector in (("displacement", displacement), ("velocity", velocity)):
             if vector.shape != (3,) or vector.dtype.kind not in "iuf":
@@ -259,7 +258,15 @@ class SimulatedScene(abc.ABC):
                     name, f"shape {vector.shape} of {vector.dtype}", "shape (3,) of numbers"
                 )
         for joint, target, speed in zip(SHIFT_JOINTS, displacement, velocity, strict=True):
+            self._drive_mount(joint, target, speed)
+
+    def _drive_mount(self, joint: str, target: float, speed: float) -> None:
+        """Set target [m] and target speed [m/s] of a joint, which the mount must have."""
+        try:
             self._move_mount(joint, target, speed)
+        except KeyError:
+            allowed = "SceneSpec.approach, yields or mount that give it one"
+            raise BadArgument("mount", f"no joint {joint}", allowed) from None
 
     def neighbour_poses(self) -> np.ndarray:
         """Return the poses (m, 4, 4) [m] of the m neighbours in the world's frame.
