@@ -262,21 +262,26 @@ def _try_body(
     return Shard((row,), Records(cloud.points.double(), eye, executable[ranks], passed, outcome))
 
 
-def draw_half(cloud: PointCloud, draw: np.random.Generator) -> Region:
-    """Draw one half of a view's bounding box: the upper one, or one end of a horizontal side."""
+def half_of(cloud: PointCloud, axis: int, far: bool) -> Region:
+    """Return the half of a cloud's bounding box at the far end of an axis, or at the near one.
+
+    It reaches over the unseen side, which is at most as deep as the object is wide.
+    """
     points = cloud.points.double()
     low = points.amin(0)
     high = points.amax(0)
     middle = (low + high) / 2
-    deep = (high - low).max()  # the unseen side is at most as deep as the object is wide
+    deep = (high - low).max()
     low = low - deep
     high = high + deep
-    axis = int(draw.integers(3))
-    if axis == 2 or draw.random() < 0.5:
-        low[axis] = middle[axis]
-    else:
-        high[axis] = middle[axis]
+    (low if far else high)[axis] = middle[axis]
     return Region.box(low, high)
+
+
+def draw_half(cloud: PointCloud, draw: np.random.Generator) -> Region:
+    """Draw one half of a view's bounding box: the upper one, or one end of a horizontal side."""
+    axis = int(draw.integers(3))
+    return half_of(cloud, axis, axis == 2 or draw.random() < 0.5)
 
 
 def best_for(tasks: Sequence[Task], hand: Hand, shape: ShapeGP, grasps: Grasps) -> list[int]:

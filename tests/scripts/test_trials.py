@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("manifold3d")
 pytest.importorskip("mujoco")
@@ -14,11 +15,12 @@ from train import trials as runner
 from train.household import CALIBRATING, FAMILIES, family_of
 from train.measured import read_trials
 from train.tasks import FORCE, FRICTION, MASS, Task, draw_ordinary, draw_task
-from train.trials import choose_ranks, read_rows, run_trials
+from train.trials import choose_ranks, half_of, read_rows, run_trials
 
 from torchgrasp.data.shards import load_shard
 from torchgrasp.foundation.errors import Status
 from torchgrasp.success.features import FEATURES
+from torchgrasp.values.planning import PointCloud
 
 
 def test_tasks_lie_within_their_bounds_and_half_keep_the_planned_friction():
@@ -65,6 +67,18 @@ def test_ranks_are_of_the_best_and_of_the_rest():
     ranks = choose_ranks(100, np.random.default_rng(1))
     assert ranks == sorted(set(ranks)) and sum(rank < 20 for rank in ranks) == runner.BEST
     assert len(ranks) == runner.BEST + runner.SPREAD and max(ranks) < 100
+
+
+@pytest.mark.parametrize(("axis", "far"), [(2, True), (0, True), (1, False)])
+def test_half_of_a_view_holds_the_points_at_its_end_and_what_is_hidden_behind_them(axis, far):
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 0.1
+    region = half_of(PointCloud(points), axis, far)
+    middle = (points[:, axis].amin() + points[:, axis].amax()) / 2
+    assert torch.equal(region(points) < 0, (points[:, axis] > middle) == far)
+    hidden = points.mean(0, keepdim=True)
+    hidden[0, (axis + 1) % 3] = 0.15
+    hidden[0, axis] = 0.09 if far else 0.01
+    assert region(hidden) < 0
 
 
 def test_ordinary_tasks_are_lighter_and_keep_the_planned_friction():

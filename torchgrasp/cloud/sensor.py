@@ -4,6 +4,7 @@ median of frames.
 
 import dataclasses
 import math
+import statistics
 import types
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -40,6 +41,8 @@ class FaultNumbers:
     """Width of the surroundings [px] whose light reaches a corner."""
     deepest: float = 0.01
     """Greatest depth [m] of a corner behind its surroundings; a deeper pixel is no corner."""
+    beside: int = 3
+    """Width [px] of the window in which a pixel is compared with those beside it, for edges."""
     fine: float = 0.5
     """Width [px] of patches of fine noise: neighbours are alike, and the next ones hardly."""
     spread: float = 0.2
@@ -287,8 +290,8 @@ def add_noise(
     lost = (rim & (uniform() < sensor.lost_rim)) | (uniform() < sensor.lost)
     lost = lost | (uniform() < (angle - low) / (high - low))
     if sensor.worn:
-        edge = (full - ndimage.minimum_filter(full, 3) > FAULTS.jump) | (
-            ndimage.maximum_filter(full, 3) - full > FAULTS.jump
+        edge = (full - ndimage.minimum_filter(full, FAULTS.beside) > FAULTS.jump) | (
+            ndimage.maximum_filter(full, FAULTS.beside) - full > FAULTS.jump
         )
         # things differ by their material: from none to twice the mean
         mean = 2.0 * sensor.worn * torch.rand((), generator=generator, dtype=torch.float64)
@@ -297,7 +300,7 @@ def add_noise(
             inward = torch.from_numpy(np.asarray(ndimage.distance_transform_edt(~edge)))
             lost = lost | (inward < width)
     if sensor.holes:
-        most = math.sqrt(2) * float(torch.special.erfinv(torch.tensor(1.0 - 2.0 * sensor.holes)))
+        most = statistics.NormalDist().inv_cdf(1.0 - sensor.holes)
         lost = lost | (patches(1.0, sensor.hole_width) > most)
     if sensor.shadow:
         column = torch.arange(depth.shape[1], dtype=torch.float64)

@@ -40,7 +40,7 @@ from torchgrasp.contacts.certify import UNIT_TOLERANCE, check_contacts, check_un
 from torchgrasp.contacts.closure_probability import drawn_contacts, line_posterior
 from torchgrasp.contacts.critical import LeastBalance, least_balance
 from torchgrasp.contacts.form_closure import Vectors, centre_and_radius, with_torque
-from torchgrasp.foundation.base import Value, at_once, in_chunks
+from torchgrasp.foundation.base import Value, at_once, in_chunks, row_numbers
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import LEAST, Force, Length, Range, Seed, is_known
@@ -67,7 +67,7 @@ class HoldProbabilityNumbers:
     critical friction has a kink, the result is too high by about as much.
     """
     rows: int = 2**15
-    """Contact sets with errors that are computed at a time."""
+    """Rows, contact sets with one error each, that are computed at a time: this bounds memory."""
     narrow: float = 1e-4
     """An interval shorter than this, in standard deviations, counts as its middle: the difference
     of Psi would be lost in rounding.
@@ -208,15 +208,20 @@ def hold_probability(
         x.expand(-1, count, *x.shape[2:]).flatten(0, 1)
         for x in (points, normals, center, errors.tilt)
     )
-    errors = dataclasses.replace(errors, tilt=tilts)
     law = Distribution.of(friction)
-    if weight is None:
-        found = _held(law, points, normals, errors)
-    else:
-        found = points.new_zeros(len(points))
+
+    def held(rows: Tensor) -> tuple[Tensor]:
+        """Return the probability for some rows, which are sets with one of their errors."""
+        parts = law, points[rows], normals[rows], dataclasses.replace(errors, tilt=tilts[rows])
+        if weight is None:
+            return (_held(*parts),)
+        found = points.new_zeros(len(rows))
         for mass, width, share in _mass_ranges(Distribution.of(weight.mass)):
-            burden = _Burden(_force(weight, mass, points), center, width / mass)
-            found = found + share * _held(law, points, normals, errors, burden)
+            burden = _Burden(_force(weight, mass, points), center[rows], width / mass)
+            found = found + share * _held(*parts, burden)
+        return (found,)
+
+    (found,) = in_chunks(held, row_numbers(points), at_once(points, HOLD.rows))
     found = found.unflatten(0, (-1, count))
     if missed is not None:
         found = torch.where(missed, 0.0, found)

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from paper.tables6_7 import format_points
 from paper.trials import Subject, TableSpec, subjects
+from train.trials import half_of
 
 from benchmarks.close.campaign import felt_surface, folder_of, keep, read_solid, run_all, table_spec
 from benchmarks.common import Options, Row, bench
@@ -79,7 +80,7 @@ def _compare(
     hand = load_hand(hand_name)
     trial = dataclasses.replace(PROTOCOLS["household"].trial, simulator=simulator, mass=solid.mass)
     cloud = read_view(folder_of(subject), subject.name, solid.view)
-    region = half_of(cloud, upper)
+    region = choose_half(cloud, upper)
     executable = list[int]()
     status = list[str]()
     seconds = list[float]()
@@ -106,23 +107,18 @@ def _compare(
     return Found(subject.family, told, *pairs, len(contacts), inside)
 
 
-def half_of(cloud: PointCloud, upper: bool) -> Region:
+def choose_half(cloud: PointCloud, upper: bool) -> Region:
     """Return the upper half of a cloud's bounding box over its table, or the half of its length
     with fewer points.
     """
+    if upper:
+        return half_of(cloud, 2, far=True)
     points = cloud.points.double()
     low = points.amin(0)
     high = points.amax(0)
-    depth = high - low  # the unseen side is at most as deep as the object is wide
-    low = low - depth.max()
-    high = high + depth.max()
-    axis = 2 if upper else int(depth[:2].argmax())
-    middle = (points[:, axis].amin() + points[:, axis].amax()) / 2
-    if upper or float((points[:, axis] > middle).double().mean()) < 0.5:
-        low[axis] = middle
-    else:
-        high[axis] = middle
-    return Region.box(low, high)
+    axis = int((high - low)[:2].argmax())
+    beyond = points[:, axis] > (low + high)[axis] / 2
+    return half_of(cloud, axis, far=float(beyond.double().mean()) < 0.5)
 
 
 def _rows(hand: str, found: Sequence[Found]) -> list[Row]:

@@ -41,7 +41,7 @@ SCENES = 100
 NEIGHBOURS = (2, 6)
 """Scenes, and least and greatest number of neighbours."""
 FIRST = 40_000
-"""Number of the first body: none of the bodies from here on is in the success model's trials."""
+"""About the number of the first body: no body near it or beyond is in the success model's trials."""
 LARGEST = 0.2
 """Greatest side [m] of a body: the hands grasp no larger ones."""
 TOUCHING = 0.001
