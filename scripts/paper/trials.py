@@ -19,13 +19,14 @@ import torch
 
 from paper.rows import Cell, Lift, Order, Plan, Row, Subject, Support, TableSpec
 from torchgrasp import close_hand, hold_probability, load_grasps, plan_grasps
+from torchgrasp.contacts.closure_probability import well_inside
 from torchgrasp.control.reference import check_single
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.files import format_json, write_file
-from torchgrasp.foundation.errors import BadArgument, GraspError, Status
+from torchgrasp.foundation.errors import GraspError, Status
 from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -259,13 +260,10 @@ class _Bench:
         """
         friction = plan.contacts().planned_friction
         shape = self.shape(view, plan.support)
-        held = list[float]()
-        for row in range(len(grasps)):
-            try:
-                held.append(float(hold_probability(grasps.contacts[[row]], friction, shape=shape)))
-            except BadArgument:
-                held.append(0.0)
-        lacks = 1 - torch.tensor(held)
+        contacts = grasps.contacts
+        inside = well_inside(shape, contacts)
+        lacks = torch.ones(len(grasps), dtype=torch.float64)
+        lacks[inside] -= hold_probability(contacts[inside], friction, shape=shape).double()
         order = lacks.argsort(descending=True, stable=True)
         return grasps[order[lacks[order] <= risk]]
 
