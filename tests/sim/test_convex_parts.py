@@ -85,6 +85,25 @@ def test_the_process_that_decomposes_loads_neither_torch_nor_the_library():
     assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "set()\n"
 
 
+def dish():
+    """A flaring dish of twelve sides, 26 mm high, with a wall of 2 mm."""
+    profile = [[0, 0], [42, 0], [60, 26], [58, 26], [40, 2], [0, 2]]
+    return trimesh.creation.revolve(np.array(profile) * 1e-3, sections=12)
+
+
+def test_convex_parts_leave_the_room_in_a_thin_dish_free(tmp_path):
+    pytest.importorskip("coacd")
+    angle, height = (
+        x.ravel() for x in np.meshgrid(np.linspace(0, 6.2, 60), np.linspace(0.003, 0.025, 12))
+    )
+    # 1.5 mm inside the cone of the inner wall, of which the twelve sides are chords
+    radius = (0.040 + 0.75 * (height - 0.002)) * np.cos(np.pi / 12) - 0.0015
+    room = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1)
+    parts = convex_parts(dish(), tmp_path)
+    filled = np.any([part.contains(room) for part in parts], axis=0)
+    assert filled.mean() < 0.02
+
+
 def test_check_parts_keeps_convex_parts_and_refuses_others_and_open_meshes():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     assert check_parts([box])[0] is box

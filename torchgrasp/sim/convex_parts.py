@@ -1,9 +1,11 @@
 """Convex parts of a mesh for the simulator, decomposed once and cached.
 
 Simulators replace a mesh by its convex hull, which would make a jug solid. CoACD cuts the mesh into
-convex parts.
+convex parts. Its measure of concavity is relative to the size of the mesh, so parts of a wide thing
+with thin walls may bulge by several walls. Such a mesh is cut finer.
 """
 
+import dataclasses
 import hashlib
 import logging
 import os
@@ -21,7 +23,26 @@ from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.mesh import LEAST_VOLUME, check_solid, read_mesh
 from torchgrasp.sim.decompose import decompose
 
-THRESHOLD = 0.05  # concavity of a part below which CoACD cuts no further
+
+@dataclasses.dataclass(frozen=True)
+class PartNumbers:
+    """Parameters of the cut of a mesh into convex parts."""
+
+    thresholds: tuple[float, ...] = (0.05, 0.02, 0.01)
+    """Concavities of a part below which CoACD cuts no further (no unit): the first at which the
+    parts do not bulge, or else the last.
+    """
+    bulge: float = 1e-3
+    """Greatest distance [m] of the parts' surface outside the mesh: `TrialSpec.overlap`, the depth
+    at which a hand may start in the parts.
+    """
+    within: float = 0.95
+    """Share of the parts' surface that must be within this distance."""
+    sampled: int = 2000
+    """Points of this surface that are measured."""
+
+
+PARTS = PartNumbers()
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """Settings of CoACD's search for cuts, which make it narrower and faster than by default."""
 MOST_PARTS = 1000  # most parts that a caller may give
@@ -36,6 +57,9 @@ def convex_parts(
 ) -> "list[trimesh.Trimesh]":
     """Return convex parts [m] whose union approximates a closed mesh; a convex mesh gives a single
     part.
+
+    Parts of which more than 5 % of the surface lies farther than 1 mm outside the mesh
+    (`PARTS.bulge`) are cut again, finer, at most twice.
 
     Args:
         mesh: the closed mesh [m], or its file.
@@ -65,13 +89,56 @@ def convex_parts(
         except (ModelFileError, ValueError):
             _log.warning("%s is damaged and will be made anew", path)
     if not parts:
-        pieces = decompose(mesh, {"threshold": THRESHOLD, **_SEARCH})
-        parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in pieces]
+        parts = _cut(mesh)
         try:
             _save(parts, path)
         except OutputError as error:
             _log.warning("convex parts are not kept: %s", error)
     return [part for part in parts if part.volume > LEAST_VOLUME]
+
+
+def _cut(mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
+    """Return the parts of the coarsest cut that does not bulge, or else of the finest one.
+
+    Raises the errors of `decompose` for the first cut. If a finer one takes too long, the parts
+    before it are returned, and a warning is logged.
+    """
+    parts = list[trimesh.Trimesh]()
+    for threshold in PARTS.thresholds:
+        try:
+            pieces = decompose(mesh, {"threshold": threshold, **_SEARCH})
+        except MeshError as error:
+            if not parts:
+                raise
+            _log.warning(
+                "parts bulge by more than %g m, and were not cut finer: %s", PARTS.bulge, error
+            )
+            break
+        parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in pieces]
+        if bulge_of(parts, mesh) <= PARTS.bulge:
+            break
+    return parts
+
+
+def bulge_of(parts: "Sequence[trimesh.Trimesh]", mesh: "trimesh.Trimesh") -> float:
+    """Return the distance [m] outside a closed mesh within which most of its parts' surface lies.
+
+    It is a quantile (`PARTS.within`) over points drawn evenly from the surfaces of the parts.
+    """
+    from trimesh.proximity import closest_point
+    from trimesh.sample import sample_surface
+
+    shares = np.array([part.area for part in parts])
+    counts = np.ceil(PARTS.sampled * shares / shares.sum()).astype(int)
+    drawn = [
+        sample_surface(part, count, seed=0)[0] for part, count in zip(parts, counts, strict=True)
+    ]
+    points = np.concatenate(drawn)
+    outside = ~mesh.contains(points)
+    height = np.zeros(len(points))
+    if outside.any():
+        height[outside] = closest_point(mesh, points[outside])[1]
+    return float(np.quantile(height, PARTS.within))
 
 
 def read_solid(
@@ -127,7 +194,7 @@ def _fingerprint(mesh: "trimesh.Trimesh") -> str:
     """Return the cache's key for a mesh: a SHA-256 of the mesh and of the settings with which it is
     cut.
     """
-    digest = hashlib.sha256(f"coacd {THRESHOLD} {sorted(_SEARCH.items())}".encode())
+    digest = hashlib.sha256(f"coacd {PARTS} {sorted(_SEARCH.items())}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
     return digest.hexdigest()
