@@ -104,6 +104,20 @@ def test_convex_parts_leave_the_room_in_a_thin_dish_free(tmp_path):
     assert filled.mean() < 0.02
 
 
+def test_bodies_that_overlap_keep_their_size_and_voids_are_not_filled(tmp_path):
+    pytest.importorskip("coacd")
+    bar = trimesh.creation.box((0.10, 0.03, 0.03))
+    other = trimesh.creation.box((0.03, 0.10, 0.03))
+    other.apply_translation((0.035, 0.035, 0.0))
+    both = bar + other
+    corners = np.concatenate([part.vertices for part in convex_parts(both, tmp_path)])
+    assert np.abs(np.stack([corners.min(0), corners.max(0)]) - both.bounds).max() < 1e-6
+    void = trimesh.creation.box((0.06, 0.06, 0.06))
+    void.invert()
+    hollow = trimesh.creation.box((0.1, 0.1, 0.1)) + void
+    assert not any(part.contains([[0.0, 0.0, 0.0]])[0] for part in convex_parts(hollow, tmp_path))
+
+
 def test_check_parts_keeps_convex_parts_and_refuses_others_and_open_meshes():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     assert check_parts([box])[0] is box
