@@ -4,6 +4,9 @@ there.
 `scripts/train.py trials` makes the trials. Two of three families fit boosted trees; more friction,
 more force and less load never lower their prediction. The other families calibrate it: they scale
 the log-odds, and give intervals. Their trials with `--best` choose the bounds of promises.
+
+Later trials judge the model. Where it is right there, they can widen the range in which its
+predictions count as known.
 """
 
 import dataclasses
@@ -18,7 +21,7 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.linear_model import LogisticRegression
 
 from torchgrasp.evaluation import summary as score
-from torchgrasp.files import save_tensors
+from torchgrasp.files import read_value, save_tensors
 from torchgrasp.foundation.base import named_tensors
 from torchgrasp.success.features import CAUSES, FEATURES
 from torchgrasp.success.model import KIND, MODEL, SuccessModel
@@ -81,6 +84,34 @@ def success(
         fitted = dataclasses.replace(fitted, kept=keep_trials(fitted, tried))
         print("best grasps:", *judge(fitted, tried), sep="\n")
         about["promised_on"] = f"{len(tried.passed)} trials of best grasps"
+    print(save_tensors(model, KIND, named_tensors(fitted), about))
+
+
+def judge_fresh(
+    folders: tyro.conf.Positional[tuple[Path, ...]],
+    workers: int = 1,
+    widen: bool = False,
+    model: Path = MODEL,
+) -> None:
+    """Judge a fitted model on trials that it has not seen, of all families.
+
+    Args:
+        folders: of `scripts/train.py trials`.
+        workers: processes that measure the grasps; the features are kept in the folders.
+        widen: also write the model with a range that includes these trials.
+        model: file of the model.
+    """
+    torch.set_num_threads(1)
+    trials = read_trials(list_hands(folders), workers)
+    fitted, about = read_value(model, KIND, SuccessModel)
+    print(*judge(fitted, trials), sep="\n")
+    if not widen:
+        return
+    seen = torch.from_numpy(find_range(trials.features))
+    low = torch.minimum(fitted.range[:, 0], seen[:, 0])
+    high = torch.maximum(fitted.range[:, 1], seen[:, 1])
+    fitted = dataclasses.replace(fitted, range=torch.stack([low, high], -1))
+    about["judged_on"] = f"{len(trials.passed)} later trials, to which the range was widened"
     print(save_tensors(model, KIND, named_tensors(fitted), about))
 
 

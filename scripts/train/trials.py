@@ -60,7 +60,14 @@ from train.tasks import (
 HANDS = ("allegro", "barrett", "leap", "shadow")
 """Hands of the trials; each body is tried with one of them."""
 
-SENSORS: tuple[bool | SensorName, ...] = (True, "realsense", "kinect_v1", "azure", "zivid")
+SENSORS: tuple[bool | SensorName, ...] = (
+    True,
+    "realsense",
+    "realsense_cloud",
+    "kinect_v1",
+    "azure",
+    "zivid",
+)
 """Noise of the views."""
 
 STARTS = 400
