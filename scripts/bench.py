@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
-* close: table-lift, where, success, sensors, play: lifts, predicted success, exports
+* close: table-lift, success: lifts, predicted success
 
 * headline: lifts, low, pulls, region, rendered, real, pace: what README says; --publish writes it
 
@@ -9,11 +9,11 @@
 
 * peers: rate: time for a grasp that passes the same checks, beside other planners
 
-* plan: pace, certificates, uncertain, critical_order: time to grasps, proofs, uncertain friction
+* plan: pace, uncertain: time to grasps, uncertain friction
 
 * scene: real, rooms, target: supports and things in depth images, a given thing among others
 
-* shape: objects, views, residuals: errors of shapes; what more views bring; how bad clouds are
+* shape: residuals: how bad clouds are
 
 Each bench prints rows, and writes them as JSON and as a Markdown table with commit, machine and
 command. A run that was stopped goes on: rows of the same commit and options are kept in --out.

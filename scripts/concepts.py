@@ -39,10 +39,9 @@ from matplotlib.axes import Axes
 HEIGHT = 0.07
 """Height [m] of the slice through the jug: its belly and its handle."""
 INK = "#1f2933"
-GREY = "#9aa5b1"
 SEEN = "#d64545"
 TRUE = "#147d64"
-"""Colours of lines, of what stands back, of what the camera saw and of the true outline."""
+"""Colours of lines, of what the camera saw and of the true outline."""
 
 
 def draw_band(path: Path) -> None:

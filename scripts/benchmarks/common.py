@@ -11,7 +11,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
@@ -19,6 +19,8 @@ import torch
 
 from torchgrasp.evaluation.intervals import Share, contrast_over
 from torchgrasp.files import write_file
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.jobs import run_tasks
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "results"
@@ -35,12 +37,22 @@ def mean_over(values: Iterable[tuple[str, float]]) -> Share:
     """Return the mean, with its 95 % interval, of values given as pairs of unit name and value; NaN
     is left out.
     """
+    return contrast_over([sum_by(values)], [1.0])
+
+
+def sum_by(values: Iterable[tuple[str, float]]) -> dict[str, tuple[float, int]]:
+    """Return the sum and the number of the values of each unit, by its name; NaN is left out."""
     sums: dict[str, tuple[float, int]] = {}
     for name, value in values:
         if not math.isnan(value):
             before = sums.get(name, (0.0, 0))
             sums[name] = before[0] + value, before[1] + 1
-    return contrast_over([sums], [1.0])
+    return sums
+
+
+def format_number(share: Share, sign: str = "+") -> str:
+    """Return a mean or a difference with its interval as text."""
+    return f"{share.value:{sign}.3f} [{share.low:{sign}.3f}, {share.high:{sign}.3f}]"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,3 +292,15 @@ def timed(action: Callable[[], Result]) -> tuple[Result, float]:
     """Return the result of an action, and the processor's time that it took [s]."""
     began = time.process_time()
     return action(), time.process_time() - began
+
+
+def run_all(
+    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], workers: int, limit: float
+) -> Iterator[Any]:
+    """Yield the result of each task; a task that fails, or takes longer than `limit` [s], ends the
+    bench.
+    """
+    for k, found in enumerate(run_tasks(work, tasks, workers, limit)):
+        if isinstance(found, Status):
+            raise SystemExit(f"{work.__name__}, task {k} of {len(tasks)}: {found.sentence}")
+        yield found

@@ -1,5 +1,6 @@
 """Views of objects with their true meshes; samples and nearest points of a mesh."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.cloud import read_cloud_file
 from torchgrasp.data import list_views, read_object_mesh, read_view
 from torchgrasp.geometry.mesh import closest_on_triangles
 from torchgrasp.values.planning import PointCloud
@@ -21,14 +23,17 @@ SEARCH_TRIANGLES = 8
 """Samples of a surface, and how many of them give the triangles among which its nearest point is
 sought.
 """
-FACING_SAMPLES = 48
-"""Samples among which those of one side of a wall are sought: they reach 6 mm around on a thing of
-a hand's size.
+HIDDEN = 0.006
+"""Distance [m] from the cloud beyond which the true surface counts as hidden."""
+TABLE_FACE = 0.002
+DOWNWARD = -0.7
+"""Height [m] over the lowest point, and upward part of the normal, below which surface is the face
+on the table.
 """
 
 
 def read_views(
-    objects: Path, camera: bool = True, views: Sequence[str] = ()
+    objects: Path, views: Sequence[str] = ()
 ) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
     """Yield object, view, noisy cloud and true mesh of every view, or of those with a name in
     `views`.
@@ -36,7 +41,16 @@ def read_views(
     for name, view in list_views(objects):
         if views and view not in views:
             continue
-        yield name, view, read_view(objects, name, view, camera), read_object_mesh(objects, name)
+        yield name, view, read_view(objects, name, view), read_object_mesh(objects, name)
+
+
+def read_cameras(folder: Path) -> dict[str, dict[str, Float[Tensor, "n 3"]]]:
+    """Return the points [m] of real things by camera, of a folder of files NAME_CAMERA.ply."""
+    clouds: dict[str, dict[str, Tensor]] = defaultdict(dict)
+    for path in sorted(folder.glob("*_*.ply")):
+        name, camera = path.stem.rsplit("_", 1)
+        clouds[name][camera] = read_cloud_file(path).cloud.points.double()
+    return clouds
 
 
 def sample_mesh(
@@ -47,21 +61,27 @@ def sample_mesh(
     return torch.from_numpy(points), torch.from_numpy(normals)
 
 
+def sample_hidden(
+    mesh: "trimesh.Trimesh", cloud: PointCloud, n: int, generator: np.random.Generator
+) -> Float[Tensor, "k 3"]:
+    """Return those of n random points of a mesh [m] that a cloud does not show; the face on the table
+    is left out.
+    """
+    from scipy.spatial import KDTree
+
+    points, normals = sample_mesh(mesh, n, generator)
+    low = float(mesh.bounds[0, 2]) + TABLE_FACE
+    on_table = (points[:, 2] < low) & (normals[:, 2] < DOWNWARD)
+    away = torch.from_numpy(KDTree(cloud.points.numpy()).query(points.numpy())[0])
+    return points[(away > HIDDEN) & ~on_table]
+
+
 def nearest_on_mesh(
-    mesh: "trimesh.Trimesh",
-    points: Float[Tensor, "n 3"],
-    facing: Float[Tensor, "n 3"] | None = None,
+    mesh: "trimesh.Trimesh", points: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Return the nearest point of a mesh to each point, with its normal.
+    """Return the nearest point of a mesh [m] to each point [m], with its normal.
 
     Only the triangles of the nearest samples are tried, for speed.
-
-    Args:
-        mesh: the surface.
-        points: [m].
-        facing: outward directions. The nearest point whose normal is less than 90 degrees from it
-            is returned: a finger outside of a wall does not touch its inside. NaN where no sample
-            nearby is turned so.
     """
     from scipy.spatial import KDTree
 
@@ -69,27 +89,16 @@ def nearest_on_mesh(
         return points, points
     samples, faces, _ = _sample(mesh, SEARCH_SAMPLES, np.random.default_rng(0))
     queries = points.numpy()
-    _, index = KDTree(samples).query(
-        queries, k=SEARCH_TRIANGLES if facing is None else FACING_SAMPLES
-    )
+    _, index = KDTree(samples).query(queries, k=SEARCH_TRIANGLES)
     candidates = faces[index]  # (n, samples)
-    turned = np.ones(candidates.shape, dtype=bool)
-    if facing is not None:
-        towards = _face_normals(mesh, candidates.reshape(-1)).reshape(*candidates.shape, 3)
-        turned = (towards * facing.numpy()[:, None]).sum(-1) > 0
-        first = np.argsort(~turned, axis=1, kind="stable")[:, :SEARCH_TRIANGLES]
-        candidates, turned = (np.take_along_axis(part, first, 1) for part in (candidates, turned))
     corners = np.asarray(mesh.triangles)[candidates.reshape(-1)]
     feet = closest_on_triangles(np.repeat(queries, SEARCH_TRIANGLES, 0), corners)[0].reshape(
         *candidates.shape, 3
     )
-    distance = np.where(turned, np.linalg.norm(feet - queries[:, None], axis=-1), np.inf)
+    best = np.linalg.norm(feet - queries[:, None], axis=-1).argmin(1)
     rows = np.arange(len(queries))
-    best = distance.argmin(1)
-    missed = ~turned.any(1)[:, None]
-    found = feet[rows, best]
     normals = _face_normals(mesh, candidates[rows, best])
-    return tuple(torch.from_numpy(np.where(missed, np.nan, part)) for part in (found, normals))  # pyright: ignore[reportReturnType]
+    return torch.from_numpy(feet[rows, best]), torch.from_numpy(normals)
 
 
 def _sample(

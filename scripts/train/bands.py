@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import tyro
 from benchmarks.common import mean_over
-from benchmarks.ground_truth import read_views, sample_mesh
+from benchmarks.ground_truth import read_views, sample_hidden
 
 from torchgrasp.data import read_entry
 from torchgrasp.files import format_columns
@@ -26,12 +25,8 @@ TOLERANCES = (0.05, 0.03, 0.015)
 """Misses of these shares that weigh the same."""
 FACTORS = np.arange(0.2, 1.5, 0.01)
 """Factors that are tried."""
-HIDDEN = 0.006
-TABLE_FACE = 0.002
 SAMPLES = 1500
-"""Distance [m] of hidden surface from the cloud; height [m] of the face on the table, which is left
-out; points.
-"""
+"""Points on the true surface of a view."""
 
 Row = dict[str, Any]
 """Family, group, the kind of hidden side with whether there was a table, errors over the
@@ -134,14 +129,9 @@ def format_shares(rows: Sequence[Row]) -> str:
 
 def measure_ratios(objects: Path, views: Sequence[str] = ()) -> list[Row]:
     """Return `Row`s of every view, or of those with a name in `views`, with and without the table."""
-    from scipy.spatial import KDTree
-
     rows = []
-    for name, _, cloud, mesh in read_views(objects, views=views):
-        points, normals = sample_mesh(mesh, SAMPLES, np.random.default_rng(0))
-        face = (points[:, 2] < float(mesh.bounds[0, 2]) + TABLE_FACE) & (normals[:, 2] < -0.7)
-        far = torch.from_numpy(KDTree(cloud.points.numpy()).query(points.numpy())[0]) > HIDDEN
-        hidden = points[far & ~face]
+    for name, _, cloud, mesh in read_views(objects, views):
+        hidden = sample_hidden(mesh, cloud, SAMPLES, np.random.default_rng(0))
         entry = read_entry(objects, name)
         told = {"family": entry.family, "group": entry.group}
         for table in (0.0, None):

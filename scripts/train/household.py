@@ -10,18 +10,16 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import trimesh
 import tyro
-from torch import Tensor
 
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.files import write_file
-from torchgrasp.values.planning import PointCloud
 from train.forms import FORMS
 from train.implements import IMPLEMENTS
 from train.solids import Thing, find_rest, turn, unite
@@ -125,26 +123,15 @@ def household(
     write_bodies(folder, {body.name: body.mesh for body in itertools.islice(bodies, count)})
 
 
-def see_noisily(mesh: trimesh.Trimesh, pose: Tensor, seed: int) -> PointCloud:
-    """Return a view of a mesh by the default camera with its noise."""
-    return partial_view(mesh, pose, seed=seed)
-
-
-def write_bodies(
-    folder: Path,
-    solids: Mapping[str, trimesh.Trimesh],
-    see: Callable[[trimesh.Trimesh, Tensor, int], PointCloud] = see_noisily,
-) -> None:
+def write_bodies(folder: Path, solids: Mapping[str, trimesh.Trimesh]) -> None:
     """Write bodies by name, FAMILY_NUMBER, as a folder of objects with one noisy view each
     (`torchgrasp.data`).
-
-    `see` returns the view of a mesh, given the camera's pose and a seed.
     """
     entries = {}
     for k, (name, mesh) in enumerate(solids.items()):
         mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])
         camera = look_at(GOLDEN_ANGLE * k % 360, 20.0 + 10.0 * (k % 4), target=mesh)
-        cloud = see(mesh, camera, k)
+        cloud = partial_view(mesh, camera, seed=k)
         pose = np.eye(4)
         pose[:3, 3] = cloud.viewpoint.numpy()  # pyright: ignore[reportOptionalMemberAccess]
         (folder / name).mkdir(parents=True, exist_ok=True)

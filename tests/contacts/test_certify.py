@@ -8,9 +8,9 @@ from fractions import Fraction
 
 import pytest
 import torch
-from benchmarks.plan.certificates import random_contacts
 from torch import Tensor
 
+from tests.contacts.exact_closure import random_contacts
 from tests.make import closure_margin, near, real, spokes
 from torchgrasp import Contacts, ContactSpec
 from torchgrasp.contacts import form_closure as closure

@@ -8,9 +8,16 @@ from fractions import Fraction
 
 import pytest
 import torch
-from benchmarks.plan.certificates import border_contacts, has_low_rank, random_contacts
-from benchmarks.plan.exact_lp import proves_margin_above, proves_margin_below, wrench_matrix
 
+from tests.contacts.exact_closure import (
+    border_contacts,
+    exact_margin,
+    has_low_rank,
+    proves_margin_above,
+    proves_margin_below,
+    random_contacts,
+    wrench_matrix,
+)
 from tests.make import near, real, spokes
 from torchgrasp import Contacts, ContactSpec, certify
 from torchgrasp.contacts.form_closure import (
@@ -112,6 +119,27 @@ def test_eq13_verdicts_are_those_of_rational_arithmetic(generator, fingertips):
         matrix = wrench_matrix(points, normals, 0.4, 8)
         assert not closed or proves_margin_above(matrix, phi[i].numpy(), bound)
         assert closed or proves_margin_below(matrix, found.witness[i].numpy(), bound)
+
+
+def test_eq13_margins_are_those_of_rational_arithmetic(generator):
+    contacts = random_contacts(10, generator, 0.4)
+    points = contacts.points
+    normals = contacts.normals
+    found = certify(contacts, ContactSpec(friction=0.6, friction_margin=1.0))
+    phi, _ = solve_closure_lp(wrenches(points, normals, 0.6, 8).flatten(1, 2))
+    for i in range(10):
+        matrix = wrench_matrix(points[i].numpy(), normals[i].numpy(), 0.6, 8)
+        exact = exact_margin(matrix)
+        little = Fraction(1, 10**9)
+        witness = found.witness[i].numpy()
+        assert float(exact) == pytest.approx(float(found.margin[i]), abs=1e-10)
+        assert [
+            proves_margin_above(matrix, phi[i].numpy(), exact + k * little) for k in (-1, 1)
+        ] == [True, False]
+        assert [proves_margin_below(matrix, witness, exact + k * little) for k in (-1, 1)] == [
+            False,
+            True,
+        ]
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.8])

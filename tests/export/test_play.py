@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from benchmarks.close.play import LEAST_SAME, PLAYERS, ROOT, play_all
 from scipy.spatial import ConvexHull
 
+from tests.export.players import LEAST_SAME, PLAYERS, ROOT, play_all
 from torchgrasp import close_hand, fit_shape, load_hand, load_object
 from torchgrasp.app import cli
 from torchgrasp.data.shipped import load_shipped_grasp
@@ -149,8 +149,7 @@ def check_verdicts(played):
 def test_a_simulator_has_the_verdict_of_our_trial(name, tmp_path):
     player, environment = PLAYERS[name]
     beside(environment)
-    folders = [(folder, 1) for folder in export_cases(tmp_path, player)]
-    check_verdicts([x.held for x in play_all(environment, folders)])
+    check_verdicts(play_all(environment, export_cases(tmp_path, player)))
 
 
 @pytest.mark.sim

@@ -4,18 +4,17 @@ goes on.
 
 import functools
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import trimesh
-from paper.trials import CELL_SECONDS, Subject, TableSpec
+from paper.trials import Subject, TableSpec
 
 from benchmarks.common import Options
-from torchgrasp import Status, fit_shape
+from torchgrasp import fit_shape
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.files import format_json, write_file
-from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
@@ -49,16 +48,6 @@ def table_spec(o: Options) -> TableSpec:
         workers=o.workers,
         seed=o.seed,
     )
-
-
-def run_all(
-    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], workers: int
-) -> Iterator[Any]:
-    """Yield the result of each task; a task that fails ends the campaign."""
-    for task, found in zip(tasks, run_tasks(work, tasks, workers, CELL_SECONDS), strict=True):
-        if isinstance(found, Status):
-            raise SystemExit(f"{task[1].name} {task[2]}: {found.sentence}")
-        yield found
 
 
 def keep(path: Path, make: Callable[[], Any]) -> Any:

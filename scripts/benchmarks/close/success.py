@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import torch
-from paper.trials import Subject, TableSpec, subjects
+from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 
-from benchmarks.close.campaign import folder_of, keep, read_solid, run_all, table_spec
-from benchmarks.common import Options, Row, bench, mean_over
+from benchmarks.close.campaign import folder_of, keep, read_solid, table_spec
+from benchmarks.common import Options, Row, bench, mean_over, run_all
 from torchgrasp import plan_grasps
 from torchgrasp.data import read_view
 from torchgrasp.evaluation import summary as score
@@ -78,7 +78,7 @@ def success(o: Options) -> list[Row]:
             named, o.hands, enumerate(FRICTIONS)
         )
     ]
-    cells = [Cell(*found) for found in run_all(try_object, tasks, spec.workers)]
+    cells = [Cell(*found) for found in run_all(try_object, tasks, spec.workers, CELL_SECONDS)]
     planned = [cell for cell in cells if cell.tried]
     return [
         Row("views with an executable grasp", "-", f"{len(planned)} of {len(cells)}"),

@@ -1,10 +1,10 @@
-"""Whether predicted success is true for pulls at the left-out objects, and what a region costs."""
+"""Whether predicted success is true for pulls at the left-out objects."""
 
 import dataclasses
 
-from paper.trials import subjects
+from paper.trials import CELL_SECONDS, subjects
 
-from benchmarks.close.campaign import run_all, table_spec
+from benchmarks.close.campaign import table_spec
 from benchmarks.close.success import (
     FRICTIONS,
     MASSES,
@@ -14,8 +14,7 @@ from benchmarks.close.success import (
     judge_promise,
     try_object,
 )
-from benchmarks.close.where import where
-from benchmarks.common import Options, Row, bench
+from benchmarks.common import Options, Row, bench, run_all
 from benchmarks.headline.left_out import LEFT_OUT
 
 
@@ -28,15 +27,9 @@ def pulls(o: Options) -> list[Row]:
         (spec, x, "allegro", FRICTIONS[k % 3], MASSES[k // 3 % 3], "mujoco")
         for k, x in enumerate(subjects(spec))
     ]
-    cells = [Cell(*found) for found in run_all(try_object, tasks, spec.workers)]
+    cells = [Cell(*found) for found in run_all(try_object, tasks, spec.workers, CELL_SECONDS)]
     planned = [cell for cell in cells if cell.tried]
     rows = [Row("views with an executable grasp", "-", f"{len(planned)} of {len(cells)}")]
     if planned:
         rows += judge_predictions(planned) + judge_order(planned) + judge_promise(planned)
     return rows
-
-
-@bench("headline/region", objects=True)
-def region(o: Options) -> list[Row]:
-    """Close the best grasp of a free plan and of one in a region, one object of each family."""
-    return where(dataclasses.replace(o, names=o.names or LEFT_OUT, hands=("allegro", "barrett")))

@@ -4,23 +4,20 @@ once; and how long plans take.
 
 import dataclasses
 import statistics
-from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
 
-from benchmarks.common import Options, Row, bench
+from benchmarks.common import Options, Row, bench, run_all
+from benchmarks.ground_truth import read_cameras
 from benchmarks.headline.left_out import LEFT_OUT, PACED
 from benchmarks.headline.touched import contact_rows
 from benchmarks.plan.pace import keep_pace
 from benchmarks.shape.accuracy import measure_shape
-from torchgrasp.cloud import read_cloud_file
 from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.data import read_object_mesh, read_view
-from torchgrasp.foundation.errors import GraspError, Status
-from torchgrasp.foundation.jobs import run_tasks
+from torchgrasp.foundation.errors import GraspError
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values.planning import PointCloud
 
@@ -43,13 +40,8 @@ LIMIT = 600.0
 @bench("headline/rendered", objects=True)
 def rendered(o: Options) -> list[Row]:
     """Compare the estimated surface of one noisy view of each object with its mesh."""
-    names = o.names or LEFT_OUT
-    tasks = [(o.objects[0], name) for name in names]
-    found = list[dict[str, float]]()
-    for name, one in zip(names, run_tasks(measure_view, tasks, o.workers, LIMIT), strict=True):
-        if isinstance(one, Status):
-            raise SystemExit(f"{name}: {one.sentence}")
-        found.append(one)
+    tasks = [(o.objects[0], name) for name in o.names or LEFT_OUT]
+    found = list(run_all(measure_view, tasks, o.workers, LIMIT))
     return [_hidden(f"rendered views of {len(found)} objects", found, "<= 2.2 mm")]
 
 
@@ -60,10 +52,7 @@ def real(o: Options) -> list[Row]:
     """
     if o.clouds is None:
         return [Row("hidden side of real clouds", "<= 3.0 mm", "not measured: no --clouds")]
-    clouds: dict[str, dict[str, torch.Tensor]] = defaultdict(dict)
-    for path in sorted(o.clouds.glob("*_*.ply")):
-        name, camera = path.stem.rsplit("_", 1)
-        clouds[name][camera] = read_cloud_file(path).cloud.points.double()
+    clouds = read_cameras(o.clouds)
     found = list[dict[str, float]]()
     floors = list[float]()
     for name, views in clouds.items():
@@ -101,9 +90,7 @@ def pace(o: Options) -> list[Row]:
 def measure_view(folder: Path, name: str) -> dict[str, float]:
     """Return the median error [mm] of the hidden side of a view, and shares within 1 to 3 std_m."""
     cloud = read_view(folder, name, "view0")
-    row: Any = measure_shape(fit_shape(cloud, table=0.0), read_object_mesh(folder, name), cloud)
-    shares = {f"within_{k}": row[f"hidden_within_{k}"] for k in (1, 2, 3)}
-    return {"median": row["hidden_median_mm"], "p90": row["hidden_p90_mm"]} | shares
+    return measure_shape(fit_shape(cloud, table=0.0), read_object_mesh(folder, name), cloud)
 
 
 def judge_hidden(

@@ -1,33 +1,18 @@
 """How long a person waits for grasps on one core: for the first, for fifty, and for all of a view."""
 
-import math
-import time
-from typing import NamedTuple
-
 import numpy as np
 from tqdm import tqdm
 
 from benchmarks.common import Options, Row, bench
 from benchmarks.ground_truth import read_views
-from benchmarks.plan.beside import compare_with_commit
-from torchgrasp import ContactSpec, Hand, PointCloud, load_hand, load_object, stream_grasps
+from benchmarks.plan.beside import FRICTIONS, Numbers, compare_with_commit
+from benchmarks.plan.timed import time_stream
+from torchgrasp import load_hand, load_object
 
-FRICTIONS = (0.6, 0.8)
 BARS = {"first": 0.4, "first, worst decile": 1.0, "fifty": 1.2, "all": 2.2}
 """Most CPU seconds of the Allegro hand from a cloud to grasps: medians but for the worst decile."""
 RATE = 110.0
 """Least executable grasps for each CPU second."""
-
-
-class Pace(NamedTuple):
-    """CPU seconds until the first grasp, until fifty and until all, NaN if there are none, and the
-    number of grasps.
-    """
-
-    first: float
-    fifty: float
-    all: float
-    grasps: int
 
 
 @bench("plan/pace", objects=True)
@@ -40,11 +25,11 @@ def keep_pace(o: Options) -> list[Row]:
     rows = list[Row]()
     for name in o.hands:
         hand = load_hand(name)
-        plan_view(load_object("jug").view, hand, FRICTIONS[0], o)
-        views = read_views(o.objects[0], views=o.views)
+        time_stream(load_object("jug").view, hand, FRICTIONS[0], o.starts, o.seed)
+        views = read_views(o.objects[0], o.views)
         seen = {one: cloud for one, _, cloud, _ in views if not o.names or one in o.names}
         found = [
-            plan_view(seen[x], hand, f, o)
+            time_stream(seen[x], hand, f, o.starts, o.seed)
             for x in tqdm(seen, disable=None, leave=False)
             for f in FRICTIONS
         ]
@@ -52,25 +37,10 @@ def keep_pace(o: Options) -> list[Row]:
     return rows
 
 
-def plan_view(cloud: PointCloud, hand: Hand, friction: float, o: Options) -> Pace:
-    """Stream the grasps of a view, and return when they came."""
-    began = time.process_time()
-    count = 0
-    first = math.nan
-    fifty = math.nan
-    for grasps in stream_grasps(
-        cloud, hand, ContactSpec(friction=friction, table=0.0), o.starts, o.seed
-    ):
-        now = time.process_time() - began
-        first = first if count else now
-        fifty = now if count < 50 <= count + len(grasps) else fifty
-        count += len(grasps)
-    return Pace(first, fifty, time.process_time() - began, count)
-
-
-def rows_of(hand: str, objects: int, found: list[Pace]) -> list[Row]:
+def rows_of(hand: str, objects: int, found: list[Numbers]) -> list[Row]:
     """Return a row for each time and one for the rate; targets are those of the Allegro hand."""
-    first, fifty, every, count = np.array(found).T
+    names = ("first", "fifty", "all", "grasps")
+    first, fifty, every, count = np.array([[x[name] for name in names] for x in found]).T
     times = {
         "first": np.nanmedian(first),
         "first, worst decile": np.nanquantile(first, 0.9),

@@ -60,15 +60,17 @@ def read_view(view: str) -> PointCloud:
         return PointCloud(**{name: torch.from_numpy(fields[name]) for name in fields.files})
 
 
-def plan(view: str, hand: str, friction: float, starts: int, seed: int) -> dict[str, float]:
-    """Return the CPU seconds to the first grasp, to fifty and to all, and the number of grasps."""
-    cloud = read_view(view)
+def time_stream(
+    cloud: PointCloud, hand: Hand, friction: float, starts: int, seed: int
+) -> dict[str, float]:
+    """Return the CPU seconds from a cloud to the first grasp, to fifty and to all, NaN if there are
+    none, and the number of grasps.
+    """
     spec = ContactSpec(friction=friction, table=0.0)
-    model = read_hand(hand)
     found = {"first": math.nan, "fifty": math.nan}
     count = 0
     began = time.process_time()
-    for grasps in stream_grasps(cloud, model, spec, starts, seed):
+    for grasps in stream_grasps(cloud, hand, spec, starts, seed):
         now = time.process_time() - began
         if not count:
             found["first"] = now
@@ -76,6 +78,11 @@ def plan(view: str, hand: str, friction: float, starts: int, seed: int) -> dict[
             found["fifty"] = now
         count += len(grasps)
     return found | {"all": time.process_time() - began, "grasps": count}
+
+
+def plan(view: str, hand: str, friction: float, starts: int, seed: int) -> dict[str, float]:
+    """Return the same for a view and a hand by their names."""
+    return time_stream(read_view(view), read_hand(hand), friction, starts, seed)
 
 
 def shape(view: str, seed: int) -> dict[str, float]:

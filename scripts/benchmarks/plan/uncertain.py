@@ -21,14 +21,13 @@ from train.household import (
     family_of,
 )
 
-from benchmarks.common import Options, Row, bench, mean_over
+from benchmarks.common import Options, Row, bench, format_number, mean_over, run_all, sum_by
 from torchgrasp import ContactSpec, Distribution, GraspTask, load_hand, plan_grasps
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.evaluation.intervals import Share, contrast_over
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.foundation.errors import GraspError, Status
-from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.geometry.frames import real
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps, PointCloud
@@ -86,9 +85,7 @@ def uncertain(o: Options) -> list[Row]:
     """Lift the best grasp of each rule at quantiles of the friction; predictions know all of it."""
     tasks = [(k, o.hands[0], o.seed, setting) for k, setting in choose_bodies(o.times(BODIES))]
     found = list[Outcome]()
-    for outcomes in run_tasks(try_body, tasks, o.workers, LIMIT):
-        if isinstance(outcomes, Status):
-            raise SystemExit(f"uncertain: a body ended with {outcomes.name}")
+    for outcomes in run_all(try_body, tasks, o.workers, LIMIT):
         print(*outcomes, sep="\n", flush=True)
         found += [Outcome(*outcome) for outcome in outcomes]
     return describe(found)
@@ -193,7 +190,7 @@ def describe(found: list[Outcome]) -> list[Row]:
         ]
     every = {rule: [x for r in REGIMES for x in cells[r, rule]] for rule in RULES}
     for rule in (MEAN, LOWEST):
-        gain = contrast_over([shares(every[HALF]), shares(every[rule])], [1.0, -1.0])
+        gain = contrast_over([sum_by(held_of(every[x])) for x in (HALF, rule)], [1.0, -1.0])
         rows.append(Row(f"held, {HALF} minus {rule}", "-", format_number(gain)))
     refused = {rule: sum(not x.executable for x in every[rule]) for rule in RULES}
     rows.append(
@@ -245,17 +242,3 @@ def mean_held(cell: Iterable[Outcome]) -> float:
 def errors(cell: Iterable[Outcome]) -> Share:
     """Return predicted minus held of the bodies with a grasp."""
     return mean_over((x.body, x.predicted - x.held) for x in cell if x.executable)
-
-
-def shares(cell: Iterable[Outcome]) -> dict[str, tuple[float, int]]:
-    """Return the sum of held shares and the number of regimes of each body."""
-    sums: dict[str, tuple[float, int]] = {}
-    for body, held in held_of(cell):
-        before = sums.get(body, (0.0, 0))
-        sums[body] = before[0] + held, before[1] + 1
-    return sums
-
-
-def format_number(share: Share, sign: str = "+") -> str:
-    """Return a number with its interval over bodies as text."""
-    return f"{share.value:{sign}.3f} [{share.low:{sign}.3f}, {share.high:{sign}.3f}]"

@@ -21,7 +21,7 @@ from torch import Tensor
 from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of
 
 from benchmarks.close.campaign import keep
-from benchmarks.common import Options, Row, bench, mean_over
+from benchmarks.common import Options, Row, bench, format_number, mean_over, run_all
 from benchmarks.scene.scenes import footprint, separation
 from torchgrasp import ContactSpec, GraspTask, Scene, load_hand, plan_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
@@ -30,7 +30,6 @@ from torchgrasp.evaluation.intervals import count_by, format_share, share_over
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.foundation.errors import GraspError, Status
-from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.planner import ScenePlan
@@ -130,9 +129,7 @@ def target(o: Options) -> list[Row]:
     load_hand(hand)
     tasks = [(o, k, hand) for k in range(o.times(SCENES))]
     found = list[TargetTry]()
-    for outcomes in run_tasks(try_scene, tasks, o.workers, LIMIT):
-        if isinstance(outcomes, Status):
-            raise SystemExit(f"target: a scene ended with {outcomes.name}")
+    for outcomes in run_all(try_scene, tasks, o.workers, LIMIT):
         tries = [read_try(outcome) for outcome in outcomes]
         print(*tries, sep="\n", flush=True)
         found += tries
@@ -337,7 +334,7 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
         Row(
             f"predicted minus held, {way}",
             "<= 0.05",
-            f"{error.value:+.3f} [{error.low:+.3f}, {error.high:+.3f}]",
+            format_number(error),
             abs(error.value) <= 0.05,
         ),
         Row(f"by the share hidden, {way}", "-", by_hidden),

@@ -7,7 +7,6 @@ other things than those in the real clouds. Here bodies by `household.py` are re
 import itertools
 import math
 import statistics
-from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -19,7 +18,8 @@ from torch import Tensor
 from train.household import CALIBRATING, GOLDEN_ANGLE, author_household, family_of
 
 from benchmarks.common import Options, Row, bench
-from torchgrasp.cloud import look_at, read_cloud_file
+from benchmarks.ground_truth import read_cameras
+from torchgrasp.cloud import look_at
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, nearest
 from torchgrasp.cloud.prepare import prepare_cloud
@@ -110,11 +110,8 @@ def residuals(o: Options) -> list[Row]:
 
 def real_pairs(folder: Path) -> Iterator[list[PointCloud]]:
     """Return the views of each thing in a folder of files NAME_CAMERA.ply, where there are two."""
-    views = defaultdict[str, list[PointCloud]](list)
-    for path in sorted(folder.glob("*_*.ply")):
-        cloud = read_cloud_file(path).cloud
-        views[path.stem.rsplit("_", 1)[0]].append(PointCloud(cloud.points.double()))
-    return (pair for pair in views.values() if len(pair) == 2)
+    things = read_cameras(folder).values()
+    return (list(map(PointCloud, views.values())) for views in things if len(views) == 2)
 
 
 def rendered_pairs(sensor: SensorName, count: int) -> Iterator[list[PointCloud]]:

@@ -17,10 +17,10 @@ import time
 import numpy as np
 import torch
 from messages import JOINTS, find_versions, print_answer, read_task
+from run_torchgrasp import describe_grasp
 from torch import Tensor
 
 from torchgrasp import Hand, load_hand
-from torchgrasp.export.postures import describe_pose
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
 
@@ -200,11 +200,7 @@ def main() -> None:
     begin = guess_poses(hand, surface, points)
     joints, poses, good = search(hand, surface, begin, task["friction"])
     seconds = time.process_time() - began
-    grasps = []
-    for row in torch.nonzero(good)[:, 0].tolist():
-        pose = describe_pose(poses[row])
-        numbers = [*pose["position"], *pose["quaternion_wxyz"]]
-        grasps.append({"joints": joints[row].tolist(), "pose": numbers})
+    rows = torch.nonzero(good)[:, 0].tolist()
     print_answer(
         fingers="four",
         sees="view",
@@ -213,7 +209,7 @@ def main() -> None:
         tried=len(begin),
         seconds=seconds,
         joint_names=JOINTS,
-        grasps=grasps,
+        grasps=[describe_grasp(joints[row].tolist(), poses[row]) for row in rows],
     )
 
 

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 import trimesh
 from messages import JOINTS, find_versions, print_answer, read_task
+from run_torchgrasp import describe_grasp
 from scipy.ndimage import map_coordinates, spline_filter
 from scipy.optimize import brentq, least_squares, minimize
 from scipy.stats import vonmises_fisher
 
 from torchgrasp import Contacts, ContactSpec, Hand, certify, load_hand
-from torchgrasp.export.postures import describe_pose
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
@@ -385,15 +385,8 @@ def main() -> None:
         tried=tried,
         seconds=seconds,
         joint_names=JOINTS,
-        grasps=[describe(x) for x in found],
+        grasps=[describe_grasp(x.joints[0].tolist(), x.obj_from_hand[0]) for x in found],
     )
-
-
-def describe(grasp: Configuration) -> dict[str, list[float]]:
-    """Return joints and pose of a grasp as lists."""
-    pose = describe_pose(grasp.obj_from_hand[0])
-    numbers = [*pose["position"], *pose["quaternion_wxyz"]]
-    return {"joints": grasp.joints[0].tolist(), "pose": numbers}
 
 
 if __name__ == "__main__":

@@ -33,10 +33,9 @@ def main(whole: bool = False) -> None:
     seconds = time.process_time() - began
     found = []
     for row in torch.nonzero(grasps.status == Status.OK)[:, 0].tolist():
-        pose = describe_pose(grasps.obj_from_hand[row])
         joints = hand.expand(grasps.joints[row])
-        numbers = [*pose["position"], *pose["quaternion_wxyz"]]
-        found.append({"joints": [float(joints[x]) for x in hand.joint_names], "pose": numbers})
+        numbers = [float(joints[name]) for name in hand.joint_names]
+        found.append(describe_grasp(numbers, grasps.obj_from_hand[row]))
     print_answer(
         fingers="default",
         sees="mesh" if whole else "view",
@@ -47,6 +46,12 @@ def main(whole: bool = False) -> None:
         joint_names=hand.joint_names,
         grasps=found,
     )
+
+
+def describe_grasp(joints: list[float], pose: torch.Tensor) -> dict[str, list[float]]:
+    """Return joints and pose (4, 4) [m] of a grasp as an answer has them."""
+    told = describe_pose(pose)
+    return {"joints": joints, "pose": [*told["position"], *told["quaternion_wxyz"]]}
 
 
 if __name__ == "__main__":

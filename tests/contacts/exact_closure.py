@@ -1,4 +1,5 @@
-"""Verdicts on closure in rational arithmetic: what is proven here is not subject to rounding.
+"""Random contacts, many at the border of closure, and verdicts on them in rational arithmetic: what
+is proven here is not subject to rounding.
 
 The wrenches are written anew from Eq. (13) and rounded to multiples of 2^-60, which is finer than
 their own rounding; from there on all is exact. A proof needs no trust in who proposes it.
@@ -8,6 +9,12 @@ from fractions import Fraction
 from itertools import combinations
 
 import numpy as np
+import torch
+
+from torchgrasp.contacts.form_closure import MIN_MARGIN, solve_closure_lp, wrenches
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.values.planning import Contacts
+from torchgrasp.values.specs import ContactSpec
 
 GRID = 60
 """Wrenches are integers over 2 to this power, witnesses and coefficients over 2 to the power of 50.
@@ -15,6 +22,46 @@ GRID = 60
 TOLERANCES = ("primal_feasibility_tolerance", "dual_feasibility_tolerance")
 NEAR_BASIS = 10
 """The largest coefficients of HiGHS among which a feasible basis is sought."""
+
+
+def random_contacts(
+    count: int, generator: torch.Generator, lean: float = 0.45, fingertips: int = 3
+) -> Contacts:
+    """Return random contacts with normals that lean away from their centre; the smaller `lean`, the
+    more are closed.
+    """
+    points, noise = (
+        torch.randn(count, fingertips, 3, generator=generator, dtype=torch.float64)
+        for _ in range(2)
+    )
+    return Contacts(points, unit(unit(points - points.mean(1, keepdim=True)) + lean * noise))
+
+
+def border_contacts(
+    count: int, fingertips: int, spec: ContactSpec, generator: torch.Generator
+) -> Contacts:
+    """Return random contacts; the normals of every second one are turned to the border of closure
+    and a little on.
+    """
+    contacts = random_contacts(count, generator, fingertips=fingertips)
+    half = count // 2
+    points = contacts.points[:half]
+    far = contacts.normals[:half]
+    near = unit(points - points.mean(1, keepdim=True))
+    low = torch.zeros(half, 1, 1, dtype=torch.float64)
+    high = torch.full((half, 1, 1), 2.0, dtype=torch.float64)
+    for _ in range(45):
+        middle = (low + high) / 2
+        wrench = wrenches(
+            points, unit(near + middle * (far - near)), spec.planned_friction, spec.edges
+        )
+        closed = (solve_closure_lp(wrench.flatten(1, 2))[0].amin(1) >= MIN_MARGIN)[:, None, None]
+        low = torch.where(closed, middle, low)
+        high = torch.where(closed, high, middle)
+    step = 10 ** (-3 - 7 * torch.rand(half, 1, 1, generator=generator, dtype=torch.float64))
+    sign = torch.sign(torch.randn(half, 1, 1, generator=generator, dtype=torch.float64))
+    turned = unit(near + (low + sign * step) * (far - near))
+    return Contacts(contacts.points, torch.cat([turned, contacts.normals[half:]]))
 
 
 def wrench_matrix(
@@ -38,6 +85,21 @@ def wrench_matrix(
             force = friction * (np.cos(turn) * along + np.sin(turn) * across) - n
             rows.append(np.concatenate([force, np.cross(p, force)]))
     return _integers(np.array(rows), GRID)
+
+
+def has_low_rank(points: np.ndarray, normals: np.ndarray, friction: float, edges: int) -> bool:
+    """Tell whether wrenches written anew lack rank, or their largest triangle is flat, to the
+    library's thresholds.
+    """
+    values = np.linalg.svd(
+        wrench_matrix(points, normals, friction, edges).astype(float), compute_uv=False
+    )
+    corners = points[list(combinations(range(len(points)), 3))]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+    ).max()
+    longest = max(((p - q) ** 2).sum() for p, q in combinations(points, 2))
+    return bool(values[-1] < 1.001e-3 * values[0] or area < 1.001e-3 * longest)
 
 
 def proves_margin_below(wrench: np.ndarray, witness: np.ndarray, bound: Fraction) -> bool:

@@ -8,38 +8,37 @@ seen. An object without a grasp fails.
 """
 
 import dataclasses
-import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from paper.tables6_7 import format_points
-from paper.trials import Subject, TableSpec, subjects
+from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 from train.trials import half_of
 
-from benchmarks.close.campaign import felt_surface, folder_of, keep, read_solid, run_all, table_spec
-from benchmarks.common import Options, Row, bench
+from benchmarks.close.campaign import felt_surface, folder_of, keep, read_solid, table_spec
+from benchmarks.common import Options, Row, bench, run_all, timed
+from benchmarks.headline.left_out import LEFT_OUT
 from torchgrasp import ContactSpec, PointCloud, Region, Status, close_hand, load_hand, plan_grasps
 from torchgrasp.data import read_view
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import seed_of
 
-OBJECTS = 24
-"""Families that are tried, in the random order of all campaigns."""
 
-
-@bench("close/where", objects=True)
-def where(o: Options) -> list[Row]:
-    """Close the best grasp of a free plan, and the best one in a region."""
-    spec = table_spec(o)
+@bench("headline/region", objects=True)
+def region(o: Options) -> list[Row]:
+    """Close the best grasp of a free plan and of one in a region, one object of each family."""
+    spec = table_spec(dataclasses.replace(o, names=o.names or LEFT_OUT))
     rows = list[Row]()
     for hand in spec.hands:
         tasks = [
             (spec, subject, hand, k % 2 == 0, o.simulator)
-            for k, subject in enumerate(subjects(spec)[:OBJECTS])
+            for k, subject in enumerate(subjects(spec))
         ]
-        rows += _rows(hand, [Found(**found) for found in run_all(compare, tasks, spec.workers)])
+        found = run_all(compare, tasks, spec.workers, CELL_SECONDS)
+        rows += _rows(hand, [Found(**fields) for fields in found])
     return rows
 
 
@@ -53,9 +52,9 @@ class Found:
 
     family: str
     region: str
-    executable: tuple[int, int]
-    status: tuple[str, str]
-    seconds: tuple[float, float]
+    executable: list[int]
+    status: list[str]
+    seconds: list[float]
     contacts: int
     inside: int
 
@@ -68,7 +67,7 @@ def compare(
     spec: TableSpec, subject: Subject, hand: str, upper: bool, simulator: str
 ) -> dict[str, Any]:
     """Return the fields of `Found` for one object; a kept result is read."""
-    path = spec.kept("where", f"{hand}_{subject.label}", upper, simulator).with_suffix(".json")
+    path = spec.kept("region", f"{hand}_{subject.label}", upper, simulator).with_suffix(".json")
     return keep(path, lambda: dataclasses.asdict(_compare(spec, subject, hand, upper, simulator)))
 
 
@@ -80,17 +79,16 @@ def _compare(
     hand = load_hand(hand_name)
     trial = dataclasses.replace(PROTOCOLS["household"].trial, simulator=simulator, mass=solid.mass)
     cloud = read_view(folder_of(subject), subject.name, solid.view)
+    contact_spec = ContactSpec(trial.friction, table=0.0)
     region = choose_half(cloud, upper)
     executable = list[int]()
     status = list[str]()
     seconds = list[float]()
     contacts = torch.zeros(0, 3)
     for chosen in (None, region):
-        began = time.process_time()
-        grasps = plan_grasps(
-            cloud, hand, ContactSpec(trial.friction, table=0.0), spec.starts, spec.seed, keep=chosen
-        )
-        seconds.append(time.process_time() - began)
+        plan = partial(plan_grasps, cloud, hand, contact_spec, spec.starts, spec.seed, keep=chosen)
+        grasps, took = timed(plan)
+        seconds.append(took)
         good = grasps[grasps.status == Status.OK]
         contacts = good.contacts.points.reshape(-1, 3)
         executable.append(len(good))
@@ -103,8 +101,7 @@ def _compare(
             status.append("NO_GRASP")
     inside = int((region(contacts) < 0).sum()) if len(contacts) else 0
     told = "upper half" if upper else "end"
-    pairs: Any = [tuple(x) for x in (executable, status, seconds)]
-    return Found(subject.family, told, *pairs, len(contacts), inside)
+    return Found(subject.family, told, executable, status, seconds, len(contacts), inside)
 
 
 def choose_half(cloud: PointCloud, upper: bool) -> Region:
