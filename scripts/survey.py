@@ -2,7 +2,8 @@
 """Count how the library is built: tokens, packed assignments, numbers in function bodies, names
 that occur twice.
 
-python scripts/survey.py            the counts, folder by folder, and the names
+python scripts/survey.py            the counts of the library, folder by folder, and the names
+python scripts/survey.py scripts    the same of another folder
 """
 
 import argparse
@@ -159,8 +160,11 @@ def report(package: Path) -> str:
 
 
 if __name__ == "__main__":
-    argparse.ArgumentParser(
+    parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    ).parse_args()
-    print(report(ROOT / "torchgrasp"))
+    )
+    parser.add_argument(
+        "folder", nargs="?", type=Path, default=ROOT / "torchgrasp", help="folder to count"
+    )
+    print(report(parser.parse_args().folder))
     sys.exit(0)

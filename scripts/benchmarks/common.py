@@ -270,24 +270,6 @@ def describe_run(threads: int) -> str:
     return f"Commit {commit}; {processor}, {os.cpu_count()} cores; {threads} threads; torch {torch.__version__}."
 
 
-def least_seconds(action: Callable[[], object], repeats: int = 5, limit: float = 5.0) -> float:
-    """Return the least time of an action [s], after one call that is not counted: more is the load
-    of others.
-
-    The time is the processor's on one thread, which waiting does not lengthen, and the wall's on
-    several. The first call alone counts when it takes more than `limit` seconds.
-    """
-    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
-    times: list[float] = []
-    for _ in range(repeats + 1):
-        began = clock()
-        action()
-        times.append(clock() - began)
-        if len(times) == 1 and times[0] > limit:
-            return times[0]
-    return min(times[1:])
-
-
 def timed(action: Callable[[], Result]) -> tuple[Result, float]:
     """Return the result of an action, and the processor's time that it took [s]."""
     began = time.process_time()

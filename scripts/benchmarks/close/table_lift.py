@@ -6,12 +6,10 @@ grasp fails.
 """
 
 import dataclasses
-import functools
+import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
-
-from paper.tables6_7 import format_points
 
 from benchmarks.common import Options, Row, bench
 from torchgrasp.app.report.evaluation_page import list_causes
@@ -25,7 +23,7 @@ from torchgrasp.evaluation import (
     evaluate,
     summarise,
 )
-from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
+from torchgrasp.evaluation.intervals import count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import draw_slide, seed_of
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -51,50 +49,29 @@ DISTANCES = {(0, 15): None, (15, 30): None, (30, 45): None, (45, 60): 0.75, (60,
 that rose.
 """
 
-SIMULATORS = "both simulators"
-"""The condition that lifts in place with both simulators; `--grasps` gives the number of grasps of
-each view.
-"""
-
-LEAST_AGREED = 0.95
-MOST_APART = 0.02
-"""Bars of the simulators: share of equal verdicts, and difference of the shares held."""
-
 
 @bench("close/table-lift", objects=True)
 def table_lift(o: Options) -> list[Row]:
     """Lift every object in each condition, with each hand."""
-    names = o.conditions or (*BARS, SIMULATORS)
     rows = list[Row]()
-    for hand in map(load_hand, o.hands):
-        lift = functools.cache(
-            functools.partial(lift_objects, o, hand)
-        )  # one condition is a part of another
-        for name in names:
-            if name == SIMULATORS:
-                rows += _agree(
-                    hand.name, lift(BASE, "sapien", o.grasps), lift(BASE, "mujoco", o.grasps)
-                )
-                continue
-            changes, least, strict = BARS[name]
-            if name == "in place" and hand.name in HANDS:
-                least = HANDS[hand.name]
-                strict = 0.0
-            protocol = dataclasses.replace(BASE, **changes)
-            scores = lift(protocol, o.simulator, 1)
-            what = f"{hand.name}, {name}"
-            found = [_row(what, scores, least, strict)]
-            found += _by_distance(what, scores, protocol.noise, o.seed)
-            print(*found, sep="\n", flush=True)
-            rows += found
+    for hand, name in itertools.product(map(load_hand, o.hands), o.conditions or BARS):
+        changes, least, strict = BARS[name]
+        if name == "in place" and hand.name in HANDS:
+            least = HANDS[hand.name]
+            strict = 0.0
+        protocol = dataclasses.replace(BASE, **changes)
+        scores = lift_objects(o, hand, protocol, o.simulator)
+        what = f"{hand.name}, {name}"
+        found = [_row(what, scores, least, strict)]
+        found += _by_distance(what, scores, protocol.noise, o.seed)
+        print(*found, sep="\n", flush=True)
+        rows += found
     return rows
 
 
-def lift_objects(
-    o: Options, hand: Hand, protocol: Protocol, simulator: str, grasps: int
-) -> list[ViewScore]:
-    """Return the scores of the objects under a protocol, with saved grasps, or with new ones that
-    are then kept.
+def lift_objects(o: Options, hand: Hand, protocol: Protocol, simulator: str) -> list[ViewScore]:
+    """Return the scores of the best grasp of each object under a protocol, with saved grasps, or
+    with new ones that are then kept.
     """
     noise = dataclasses.replace(protocol.noise, draws=o.draws)
     tries = o.tries or protocol.tries
@@ -108,7 +85,7 @@ def lift_objects(
         if o.names and not here:
             continue
         spec = EvaluationSpec(
-            grasps, starts=o.starts, only=here, seed=o.seed, views=1, planned=_kept(shelf)
+            1, starts=o.starts, only=here, seed=o.seed, views=1, planned=_kept(shelf)
         )
         found += evaluate(folder, hand, protocol, spec, folder=shelf, workers=o.workers)
     return found
@@ -175,30 +152,3 @@ def _strict(score: ViewScore) -> ViewScore:
     return dataclasses.replace(
         score, attempts=tuple(dataclasses.replace(x, passed=x.held) for x in score.attempts)
     )
-
-
-def _agree(hand: str, first: Sequence[ViewScore], second: Sequence[ViewScore]) -> Iterator[Row]:
-    """Yield how often two simulators agree that an object has risen, and that it is held without
-    slip.
-    """
-    kinds = {
-        "risen": (first, second),
-        "without slip": (list(map(_strict, first)), list(map(_strict, second))),
-    }
-    for kind, both in kinds.items():
-        one, other = (
-            {(x.object, a.rank, a.draw): (x.unit, a.passed) for x in s for a in x.attempts}
-            for s in both
-        )
-        keys = sorted(one.keys() & other.keys())
-        same = share_over(count_by((one[key][0], one[key][1] == other[key][1]) for key in keys))
-        there, here = (count_by(some[key] for key in keys) for some in (one, other))
-        apart = contrast_over([here, there], [1.0, -1.0])
-        words = f"{format_share(same)}; {share_over(there).value:.1%} in SAPIEN, MuJoCo {format_points(apart)}"
-        differ = [
-            (*key, one[key][1], other[key][1]) for key in keys if one[key][1] != other[key][1]
-        ]
-        met = same.value >= LEAST_AGREED and abs(apart.value) <= MOST_APART
-        bar = f">= {LEAST_AGREED:.0%}, within {100 * MOST_APART:.0f} points"
-        numbers = {"same": same, "apart": apart, "differ": differ}
-        yield Row(f"{hand}, same verdict, {kind}", bar, words, met, numbers)

@@ -64,7 +64,7 @@ def _tried(
     protocol = dataclasses.replace(BASE, **changes)
 
     def try_objects() -> list[Row]:
-        scores = lift_objects(o, load_hand(hand), protocol, simulator, 1)
+        scores = lift_objects(o, load_hand(hand), protocol, simulator)
         return [row_of(hand, condition, simulator, scores, bar)]
 
     words = f"headline {hand} {condition} {simulator}"
