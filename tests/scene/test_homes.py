@@ -205,3 +205,24 @@ def test_the_neighbours_in_the_advice_are_those_that_are_there():
         words[kind] = [change.words for change in list_changes(request)]
     assert any("no object (a wall, or furniture" in text for text in words["lone"])
     assert any("its neighbours (object" in text for text in words["cabinet"])
+
+
+def tray() -> list[trimesh.Trimesh]:
+    """A bin whose floor is 2 cm above the room's, with things in it."""
+    sides = [box((0.01, 0.54, 0.1), (x, 0.0)) for x in (-0.21, 0.21)]
+    sides += [box((0.42, 0.01, 0.1), (0.0, y)) for y in (-0.27, 0.27)]
+    return [box((0.42, 0.54, 0.01), (0.0, 0.0, -0.005)), *sides, *others()]
+
+
+@pytest.mark.parametrize("sensor", ["zivid", "realsense"])
+@pytest.mark.parametrize("view", [(20.0, 60.0, 0.8), (140.0, 55.0, 0.7), (250.0, 65.0, 0.85)])
+def test_the_floor_of_a_bin_is_found_a_little_above_the_floor_of_the_room(view, sensor):
+    floor = box((3.0, 3.0, 0.02), (0.0, 0.0, -0.03))
+    pose = look_at(*view, torch.tensor([0.03, 0.02, 0.0]))
+    depth, _ = render_depth([*tray(), floor], pose, table=None, noise=sensor, seed=0)
+    intrinsics = INTRINSICS.clone()
+    intrinsics[:2] /= 2
+    near = depth[::2, ::2].float()
+    seen = Home(near, intrinsics, near > 0, pose)
+    degrees, mm = seen.error(seen.see())
+    assert degrees < 1 and mm < 3

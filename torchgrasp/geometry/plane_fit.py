@@ -7,12 +7,12 @@ import math
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import row_numbers
 from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.linalg import Points, Vector, norm
+from torchgrasp.geometry.linalg import Points, Vector, norm, number_rows, unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +63,22 @@ class PlaneNumbers:
     """
     steps: int = 30
     """Most steps of a fit."""
+    patch: float = 0.05
+    """Width [m] of the patches that tell the direction of parallel levels: few hold a step."""
+    flattest: float = 1.5
+    """Greatest scatter of a patch without a step, over the median one."""
+    rounds: int = 3
+    """Rounds in which patches with a step are left out."""
+    offsets: int = 100
+    """Number of heights at which a level is sought."""
+    aslant: float = 10.0
+    """Greatest angle [deg] between two levels and one plane through both."""
+    mixed: float = 0.7
+    """Least scale of a plane that may go aslant through two levels."""
+    again: float = 0.001
+    """Difference of two planes (normal, and offset [m]) below which a fit has found one again."""
+    both: float = 0.7
+    """Least points on two levels, over those on one plane through both."""
     still: float = 1e-12
     """Change of a plane (normal, and offset [m]) below which its fit ends."""
 
@@ -100,6 +116,10 @@ class SeenPoints:
         self.eye = eye
         self.sky = sky
         self.noise = assume_noise(points, eye)
+
+    def part(self, of: Bool[Tensor, "n"]) -> "SeenPoints":
+        """Return some of the points, given by a mask, in the same frame."""
+        return SeenPoints(self.points[of], self.eye, self.sky)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,18 +165,98 @@ def fit_planes(view: SeenPoints, generator: torch.Generator) -> Iterator[PlaneFi
     normals, offsets = _propose(view, generator)
     held = _held(points, noise, normals, offsets)  # (m, n)
     left = torch.ones(len(points), dtype=torch.float32, device="cpu")
+    rest = torch.ones(len(view.points), dtype=torch.bool, device="cpu")
+    found = list[PlaneFit]()
     for _ in range(PLANES.planes if len(held) else 0):
         counts = held @ left
         i = int(counts.argmax())
         if int(counts[i]) < 0.5 * PLANES.least_share * len(points):
             break
         fit = refine_plane(view, normals[i], float(offsets[i]))
-        rough = fit.scale >= PLANES.rough
-        yield (
-            dataclasses.replace(fit, normal=normals[i], offset=float(offsets[i])) if rough else fit
-        )
-        beside = (points @ fit.normal - fit.offset).abs() > PLANES.core * noise
-        left = left * beside * (1 - held[i])
+        if any(_is_same(fit, other) for other in found):
+            # the larger plane has drawn the fit away
+            fit = refine_plane(view.part(rest), normals[i], float(offsets[i]))
+        left = left * (1 - held[i])
+        for plane in _levels(view, fit) or [fit]:
+            rough = plane.scale >= PLANES.rough
+            as_proposed = dataclasses.replace(fit, normal=normals[i], offset=float(offsets[i]))
+            found.append(as_proposed if rough else plane)
+            yield found[-1]
+            height = (view.points @ plane.normal - plane.offset).abs()
+            rest &= height > PLANES.core * view.noise
+            left = left * (height > PLANES.core * view.noise)[: len(left)]
+
+
+def _is_same(fit: PlaneFit, other: PlaneFit) -> bool:
+    """Return whether two fits are of one plane."""
+    turn = float((fit.normal * torch.sign(fit.normal @ other.normal) - other.normal).abs().max())
+    shift = abs(fit.offset * float(torch.sign(fit.normal @ other.normal)) - other.offset)
+    return turn + shift < PLANES.again
+
+
+def _levels(view: SeenPoints, fit: PlaneFit) -> list[PlaneFit]:
+    """Return the two parallel levels through which a fit goes aslant, as through the floors of a
+    room and of a bin in it; an empty list if it is one plane.
+    """
+    if fit.scale < PLANES.mixed:
+        return []
+    height = (view.points @ fit.normal - fit.offset).abs()
+    left = view.part(height < PLANES.core * fit.scale * view.noise)
+    if len(left.points) < PLANES.least_share * len(view.points):
+        return []
+    normal = _common_normal(left.points, fit.normal)
+    if float(normal @ fit.normal) < math.cos(math.radians(PLANES.aslant)):
+        return []
+    levels = list[PlaneFit]()
+    while len(levels) < 2 and len(left.points):
+        heights = left.points @ normal
+        some = heights[: PLANES.scored]
+        offsets = some.quantile(torch.linspace(0, 1, PLANES.offsets).to(some))
+        held = (some - offsets[:, None]).abs() < 2 * left.noise[: PLANES.scored]
+        offset = float(offsets[held.sum(1).argmax()])
+        # the other level would pull at the plane
+        near = (view.points @ normal - offset).abs() < PLANES.core * view.noise
+        level = refine_plane(view.part(near), normal, offset)
+        if levels:
+            # the smaller level is parallel: things on it would tilt it
+            moved = float((view.points[near] @ normal).median())
+            level = dataclasses.replace(level, normal=normal, offset=moved)
+        normal = level.normal
+        beside = (left.points @ normal - level.offset).abs() > PLANES.core * left.noise
+        left = left.part(beside)
+        levels.append(level)
+    # each is as flat as the noise: tops of things are not
+    if len(levels) < 2 or max(level.scale for level in levels) > 1:
+        return []
+    if sum(level.count for level in levels) < PLANES.both * fit.count:
+        return []
+    gap = abs(levels[0].offset - levels[1].offset)
+    apart = PLANES.core * float(view.noise.median()) * (levels[0].scale + levels[1].scale)
+    return levels if gap > apart else []
+
+
+def _common_normal(points: Points, normal: Vector) -> Vector:
+    """Return the unit normal that parallel levels of points [m] near a plane share, whatever their
+    offsets: it is fitted to patches of them, without those in which a step lies.
+    """
+    patch = number_rows(torch.floor(points @ plane_axes(normal, points) / PLANES.patch).long())
+    count = torch.bincount(patch).to(points)
+    middle = points.new_zeros(len(count), 3).index_add_(0, patch, points) / count[:, None]
+    rest = points - middle[patch]
+    kept = torch.ones_like(patch, dtype=torch.bool)
+    turned = normal
+    for _ in range(PLANES.rounds):
+        turned = torch.linalg.eigh(rest[kept].T @ rest[kept]).eigenvectors[:, 0]
+        scatter = (torch.bincount(patch, (rest @ turned).square()) / count)[patch]
+        kept = scatter <= PLANES.flattest * scatter.median()
+    return turned if float(turned @ normal) > 0 else -turned
+
+
+def plane_axes(normal: Vector, points: Points) -> Float[Tensor, "3 2"]:
+    """Return two unit vectors (columns) perpendicular to a normal; they rotate with the points."""
+    side = points[0] - points.mean(0)
+    x = unit(side - (side @ normal) * normal)
+    return torch.stack([x, torch.linalg.cross(normal, x)], -1)
 
 
 def _propose(

@@ -23,6 +23,7 @@ from torchgrasp.geometry.plane_fit import (
     SeenPoints,
     assume_noise,
     fit_planes,
+    plane_axes,
     refine_plane,
 )
 
@@ -346,7 +347,7 @@ def bound(
     if int(on.sum()) < 3:
         return None
     middle = points[on].mean(0)
-    axes = _axes(plane.normal.to(points), points[on])
+    axes = plane_axes(plane.normal.to(points), points[on])
     crossing, behind = cross(plane, points, eye)
     # (n, 2), in the plane
     flat = (points[on] - middle) @ axes
@@ -382,13 +383,6 @@ def _crossed(
     below = ~on & (height < 0) & (height > -SUPPORTS.low)
     lower = torch.bincount(cells, below.double())
     return (lower > SUPPORTS.crossed * torch.bincount(cells, on.double()))[cells]
-
-
-def _axes(normal: Vector, points: Points) -> Float[Tensor, "3 2"]:
-    """Return two unit vectors (columns) perpendicular to a normal; they rotate with the points."""
-    side = points[0] - points.mean(0)
-    x = unit(side - (side @ normal) * normal)
-    return torch.stack([x, torch.linalg.cross(normal, x)], -1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -475,11 +469,15 @@ def cross(plane: Plane, points: Points, eye: Vector | None) -> tuple[Points, Boo
 
 @dataclasses.dataclass(frozen=True)
 class _Candidate:
-    """A support, its score (points low above it), and a point [m] in the middle of its region."""
+    """A support, its score (points low above it), and a point [m] in the middle of its region.
+
+    `thickness` [m] is the usual greatest distance of a point on it.
+    """
 
     support: SupportPlane
     score: float
     middle: Vector
+    thickness: float
 
     def parallel(self, other: "_Candidate") -> bool:
         """Return whether two planes are parallel within ten degrees."""
@@ -489,16 +487,17 @@ class _Candidate:
     def repeats(self, other: "_Candidate") -> bool:
         """Return whether the other candidate is a fit of the same plane."""
         height = float(other.support.plane.height(self.middle))
-        return self.parallel(other) and abs(height) < SUPPORTS.same
+        same = min(SUPPORTS.same, max(self.thickness, other.thickness))
+        return self.parallel(other) and abs(height) < same
 
 
 def _ordered(found: list[_Candidate]) -> list[_Candidate]:
-    """Return the candidate supports ordered by score, with the highest wide support parallel to the
-    best one first.
+    """Return the candidate supports ordered by score, with the best wide support parallel to the
+    best one and higher first.
     """
     found = sorted(found, key=lambda candidate: -candidate.score)
     best = found[0]
-    for candidate in found:
+    for candidate in found[1:]:
         wide = candidate.support.width > SUPPORTS.furniture and candidate.parallel(best)
         if wide and float(best.support.plane.height(candidate.middle)) > 0:
             return [candidate, *(other for other in found if other is not candidate)]
@@ -518,8 +517,7 @@ def _refit(view: SeenPoints, fit: PlaneFit) -> PlaneFit:
     own = support.covers(view.points) & (height.abs() < SUPPORTS.bow)
     if int(own.sum()) < SUPPORTS.least_points:
         return fit
-    part = SeenPoints(view.points[own], view.eye, view.sky)
-    return refine_plane(part, fit.normal, fit.offset)
+    return refine_plane(view.part(own), fit.normal, fit.offset)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -614,7 +612,7 @@ def _judge(
     favour = SUPPORTS.favour if _looked_at(view, surface.fit, support) else 1.0
     favour *= SUPPORTS.bowed if surface.bowed else 1.0
     score = count - SUPPORTS.plain * int((risen.standing & plain).sum())
-    return _Candidate(support, score * favour, middle)
+    return _Candidate(support, score * favour, middle, float(surface.tolerance[own].median()))
 
 
 def _refuse_plane(view: SeenPoints, surface: _FlatSurface) -> str:
@@ -646,7 +644,7 @@ def _count_through(view: SeenPoints, surface: _FlatSurface, support: SupportPlan
     inner = SUPPORTS.edge * support.width
     crossing, behind = cross(support.plane, view.points, view.eye)
     seen = behind & (surface.height < -surface.tolerance) & support.covers(crossing, -inner)
-    axes = _axes(surface.fit.normal, view.points)
+    axes = plane_axes(surface.fit.normal, view.points)
     # slats show what is behind them beside points of their own
     cell = _number_cells(crossing, axes, SUPPORTS.cell)
     slats = torch.bincount(cell, surface.on.double())
@@ -708,7 +706,7 @@ def _count_pierced(view: SeenPoints, surface: _FlatSurface, risen: _Risen) -> in
     """Return the number of standing points with many points below the plane under them."""
     depth = -surface.height
     below = (depth > SUPPORTS.sag * surface.tolerance) & (depth < SUPPORTS.low)
-    axes = _axes(surface.fit.normal, view.points)
+    axes = plane_axes(surface.fit.normal, view.points)
     cell = _number_cells(view.points, axes, SUPPORTS.pierced_cell)
     under = torch.bincount(cell, below.double())
     standing = torch.bincount(cell, risen.standing.double())
