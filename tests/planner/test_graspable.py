@@ -7,9 +7,9 @@ import pytest
 import torch
 import trimesh
 
-from tests.make import HALF, half_ball, halved, load_hand, see
+from tests.make import HALF, box, half_ball, halved, load_hand, see
 from torchgrasp import ContactSpec, Scene, Status, plan_scene
-from torchgrasp.cloud.camera import look_at, render_depth
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.planner import ThingPlan
 from torchgrasp.planner.graspable import hand_span, is_vague, judge_things, order_by_ease
@@ -177,6 +177,30 @@ def test_success_is_unknown_for_a_target_much_of_which_another_object_hides(asid
     hidden = aside < 0.1
     assert bool(scene.select(1).covers) == hidden
     assert bool(ranked.known.any()) != hidden
+
+
+# each time two boxes: sizes and places; only the target of the last has a sure outline
+GUESSED = {
+    "touch": [((0.06, 0.08, 0.12), (-0.031, 0.0)), ((0.06, 0.1, 0.05), (0.03, 0.02))],
+    "gaps": [((0.02, 0.16, 0.02), (0.0, 0.0)), ((0.14, 0.02, 0.02), (0.08, 0.08))],
+    "apart": [((0.05, 0.05, 0.09), (0.0, -0.06)), ((0.05, 0.05, 0.09), (0.0, 0.06))],
+}
+
+
+@pytest.mark.parametrize("kind", GUESSED)
+def test_success_is_unknown_for_a_clicked_target_whose_outline_is_a_guess(kind):
+    camera = look_at(20.0, 45.0, 0.6)
+    depth, labels = render_depth([box(*one) for one in GUESSED[kind]], camera)
+    row, column = torch.nonzero(labels == 1).double().mean(0).round().int().tolist()
+    for given in ({"point": (column, row)}, {"mask": labels == 1}):
+        scene = Scene.from_depth(depth, INTRINSICS, camera, table=0.0, **given)
+        objects = pose_request(Request(scene, HAND), HAND)
+        grasps = load_shipped_grasp("jug", "allegro")
+        (ranked,) = rank(objects, grasps, torch.zeros_like(grasps.status))
+        unknown = kind != "apart" and "point" in given
+        assert bool(scene.doubts) == unknown and bool(ranked.known.any()) != unknown
+        assert any("its success is unknown: give its mask" in x for x in scene.advice) == unknown
+        assert set(scene.doubts) <= set(scene.advice)
 
 
 def test_a_heap_of_specks_costs_no_planning(monkeypatch):

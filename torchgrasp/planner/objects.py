@@ -81,7 +81,7 @@ class ShapedObject:
     transform from the upright frame to the caller's. `shape` is the estimated shape, `surface` its
     mesh [m], and `body` the estimates from which success is predicted. `vague` says that the
     camera hardly saw the object: few points, one plane, a part beyond the image border, or much of
-    it behind another object. `obstacles`
+    it behind another object. It is also so if the outline is a guess (`Scene.doubts`). `obstacles`
     surround a scene's target; None without a scene.
     """
 
@@ -127,7 +127,7 @@ class ShapedObject:
         obstacles = None
         vague = is_vague_cloud(cloud)
         if scene is not None:
-            vague = vague or bool(scene.covers)
+            vague = vague or bool(scene.covers) or bool(scene.doubts)
             scene = scene.to_upright(frame)
             if scene.target is not None:
                 obstacles = Obstacles.of(estimate_occupancy(scene, scene.target))

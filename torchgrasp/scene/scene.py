@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.pose import check_sizes, find_plausible, tell_furniture, tell_tilt
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
-from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.base import Value, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage, spatial
@@ -68,6 +68,8 @@ class SceneNumbers:
 
 
 SCENE = SceneNumbers()
+Guess = tuple[tuple[int, ...], str]
+"""Labels of objects whose outlines are guesses, and a sentence that says why."""
 LOCAL = (
     "the support is bowed or small: its plane was fitted to a part of it, and holds near that part"
 )
@@ -357,41 +359,64 @@ class Scene(Value):
         * The target is not `given`, is long, and has gaps in its outline: it may be several, too.
         * The target is cut off at the border of the image.
         * Another object hides much of the target.
+        * The target has `doubts`, so that its success is unknown.
         """
         found = [
             f"objects could also stand on another plane ({plane.describe()}); "
             "give it as the table to choose it"
             for plane in self.others
         ]
-        labels = self.pixel_labels
-        points = self.image.points()
-        for a, b in find_touching(self.image, points, labels):
-            if a in self.given and b in self.given:
-                continue
-            found.append(
-                f"objects {a} and {b} touch, and their border is a guess: "
-                "give a mask of the one to grasp"
-            )
-        parts = cut_creases(self.image, points, labels)
-        for k in (k for k in self.things if k not in self.given):
-            sizes = parts[labels == k].unique(return_counts=True)[1]
-            if int((sizes > SCENE.part * sizes.sum()).sum()) > 1:
-                found.append(
-                    f"object {k} has a crease: if it is several objects, "
-                    "give a mask of the one to grasp"
-                )
-            elif k == self.target and self._sprawls(labels):
-                found.append(
-                    "the target is long and has gaps in its outline: if it is several objects, "
-                    "give a mask of the one to grasp"
-                )
+        guesses = self._guesses()
+        found += [sentence for _, sentence in guesses]
         if self.image.at_border(self.pixels[self.rows_of()]):
             fix = "its other part is unknown; turn the camera to it"
             found.append(f"the target is cut off at the border of the image: {fix}")
         for k, share in self.covers.items():
             fix = f"turn the camera, or take object {k} away first"
             found.append(f"object {k} stands before {share:.0%} of the target's outline: {fix}")
+        if self._on_target(guesses):
+            found.append(
+                "the target's outline is a guess, so its success is unknown: give its mask"
+            )
         return tuple(found)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why the target may be several objects, or a part of one, a sentence each: those of
+        `advice` on its creases, on gaps in its outline, and on objects that touch it.
+
+        Empty without a target. Empty for a target that is `given`, too: its outline is no guess.
+        """
+        return self._on_target(self._guesses())
+
+    def _on_target(self, guesses: list[Guess]) -> tuple[str, ...]:
+        """Return the sentences of those guesses that are on a target which is not `given`."""
+        if self.target is None or self.target in self.given:
+            return ()
+        return tuple(sentence for labels, sentence in guesses if self.target in labels)
+
+    def _guesses(self) -> list[Guess]:
+        """Return the labels of objects whose outlines are guesses, each time with a sentence that
+        says why.
+        """
+        found = list[Guess]()
+        scene = settle(self, torch.device("cpu"))
+        labels = scene.pixel_labels
+        points = scene.image.points()
+        for a, b in find_touching(scene.image, points, labels):
+            if a in self.given and b in self.given:
+                continue
+            text = f"objects {a} and {b} touch, and their border is a guess: "
+            found.append(((a, b), text + "give a mask of the one to grasp"))
+        parts = cut_creases(scene.image, points, labels)
+        several = ": if it is several objects, give a mask of the one to grasp"
+        for k in (k for k in self.things if k not in self.given):
+            sizes = parts[labels == k].unique(return_counts=True)[1]
+            if int((sizes > SCENE.part * sizes.sum()).sum()) > 1:
+                found.append(((k,), f"object {k} has a crease{several}"))
+            elif k == self.target and scene._sprawls(labels):
+                found.append(((k,), f"the target is long and has gaps in its outline{several}"))
+        return found
 
     def _sprawls(self, labels: Int[Tensor, "h w"]) -> bool:
         """Return whether the target is long, and does not fill the convex hull of its pixels."""

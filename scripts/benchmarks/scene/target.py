@@ -92,8 +92,9 @@ class TargetTry:
 
     `purity` is the share of the pixels taken for the target that are its own, and `share` the share
     of its own measured pixels that are taken. Without a grasp, `said` is the reason, and `clear`
-    counts the neighbours to take away first. `doubted` tells whether advice names the target. A
-    refused target has pixels and prediction 0. `moved` [m] is the largest motion of a neighbour.
+    counts the neighbours to take away first. `doubted` tells whether advice names the target. The
+    prediction is NaN if the success is unknown. A refused target has pixels and prediction 0.
+    `moved` [m] is the largest motion of a neighbour.
     """
 
     scene: int
@@ -120,6 +121,13 @@ class TargetTry:
     def asked(self) -> bool:
         """Whether the library planned nothing and said why."""
         return self.status == "NO_GRASP" and bool(self.said)
+
+    @property
+    def unknown(self) -> bool:
+        """Whether grasps were planned without a promise: advice says why their success is
+        unknown.
+        """
+        return self.status != "NO_GRASP" and self.doubted and math.isnan(self.predicted)
 
 
 @bench("scene/target")
@@ -301,6 +309,9 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
     held = share_over(count_by((x.family, x.held) for x in tries))
     good = share_over(count_by((x.family, x.held or x.asked) for x in tries))
     wary = share_over(count_by((x.family, x.held or x.asked or x.doubted) for x in tries))
+    frank = share_over(count_by((x.family, x.held or x.asked or x.unknown) for x in tries))
+    unknown = [x for x in planned if x.unknown]
+    promised = [x for x in planned if not math.isnan(x.predicted)]
     of_planned = share_over(count_by((x.family, x.held) for x in planned))
     pushed = share_over(count_by((x.family, x.moved > MOVED) for x in planned))
     error = mean_over((x.family, x.predicted - x.held) for x in planned)
@@ -324,6 +335,14 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
             f"{words}; held of planned {format_share(of_planned)}",
             first.value >= bar,
             {"tries": [dataclasses.asdict(x) for x in tries]},
+        ),
+        Row(
+            f"target by {way}; an unknown success, told with its cause, counts as asked",
+            f">= {bar:.0%} held or asked" if asking else "-",
+            f"held, asked or told that success is unknown {format_share(frank)}; success unknown: "
+            f"{len(unknown)}, of which {sum(x.held for x in unknown)} held; of those with a known "
+            f"success {sum(x.held for x in promised)} of {len(promised)} held",
+            frank.value >= bar if asking else None,
         ),
         Row(
             f"a neighbour moved by more than 2 cm, {way}",
