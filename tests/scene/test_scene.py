@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -191,6 +193,16 @@ def test_an_object_that_hides_much_of_the_target_is_told(x, height, covers):
     told = [x for x in seen.select(1).advice if x.startswith("object 2 stands before")]
     assert len(told) == covers
     assert not any("stands before" in x for x in seen.advice)  # no target
+
+
+def test_a_target_of_two_parts_apart_in_depth_is_told_unless_its_mask_is_given():
+    bodies = [cylinder(-0.06, 0.12), cylinder(0.04, 0.05)]
+    depth, labels = render_depth(bodies, look_at(0.0, 35.0, 0.7))
+    seen = Scene.from_depth(depth, K, look_at(0.0, 35.0, 0.7), labels=labels)
+    both = dataclasses.replace(seen, labels=(seen.labels > 0).long(), target=1, given=())
+    assert [x.startswith("the target has a jump in depth") for x in both.doubts] == [True]
+    assert dataclasses.replace(both, given=(1,)).doubts == ()
+    assert dataclasses.replace(seen, target=1, given=()).doubts == ()
 
 
 @pytest.mark.parametrize(

@@ -19,11 +19,12 @@ from torchgrasp.foundation.rules import Pose, Positive
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import Points, norm
 from torchgrasp.geometry.plane import Plane, to_upright
-from torchgrasp.geometry.support_planes import Target, find_table
+from torchgrasp.geometry.support_planes import SupportPlane, Target, find_table
 from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage, find_nearest, image_of_cloud, read_image
 from torchgrasp.scene.masks import label_image, read_labels, read_mask
 from torchgrasp.scene.merge import find_touching
+from torchgrasp.scene.segment import find_components
 from torchgrasp.scene.table_image import TableImage
 from torchgrasp.values.planning import PointCloud
 
@@ -40,6 +41,8 @@ class SceneNumbers:
     """Largest distance [m] of a given point from a measured one."""
     part: float = 0.1
     """Share of an object's pixels beyond a crease that may be another object."""
+    apart: float = 0.2
+    """Share of an object's pixels before or behind a jump that may be another object."""
     across: float = 0.19
     """Distance [m] of a target's two farthest points from which it may be several objects: hands
     grasp few that are longer.
@@ -356,7 +359,8 @@ class Scene(Value):
         * Objects could also stand on another plane than `table`.
         * Two objects touch, so that the border between them is a guess; not if both are `given`.
         * An object that is not `given` has a crease: it may be several objects.
-        * The target is not `given`, is long, and has gaps in its outline: it may be several, too.
+        * The target is not `given`, and has a jump in depth, or is long and has gaps in its outline:
+          it may be several, too.
         * The target is cut off at the border of the image.
         * Another object hides much of the target.
         * The target has `doubts`, so that its success is unknown.
@@ -383,7 +387,7 @@ class Scene(Value):
     @property
     def doubts(self) -> tuple[str, ...]:
         """Why the target may be several objects, or a part of one, a sentence each: those of
-        `advice` on its creases, on gaps in its outline, and on objects that touch it.
+        `advice` on creases and jumps in it, on gaps in its outline, and on objects that touch it.
 
         Empty without a target. Empty for a target that is `given`, too: its outline is no guess.
         """
@@ -414,9 +418,18 @@ class Scene(Value):
             sizes = parts[labels == k].unique(return_counts=True)[1]
             if int((sizes > SCENE.part * sizes.sum()).sum()) > 1:
                 found.append(((k,), f"object {k} has a crease{several}"))
+            elif k == self.target and scene._jumps(labels == k):
+                found.append(((k,), f"the target has a jump in depth{several}"))
             elif k == self.target and scene._sprawls(labels):
                 found.append(((k,), f"the target is long and has gaps in its outline{several}"))
         return found
+
+    def _jumps(self, mask: Bool[Tensor, "h w"]) -> bool:
+        """Return whether large parts of an object's pixels lie apart in depth."""
+        view = TableImage.of(self.image, SupportPlane(self.table or Plane.horizontal(0.0))).smooth
+        parts = find_components(view, mask & view.measured)
+        sizes = parts[parts > 0].unique(return_counts=True)[1]
+        return int((sizes > SCENE.apart * int(mask.sum())).sum()) > 1
 
     def _sprawls(self, labels: Int[Tensor, "h w"]) -> bool:
         """Return whether the target is long, and does not fill the convex hull of its pixels."""

@@ -85,9 +85,9 @@ def segment(view: TableImage) -> Int[Tensor, "h w"]:
     risen = _risen(view)
     risen[risen.clone()] = view.support.covers(view.points[risen], SEGMENT.overhang)
     core = _core(smooth, risen)
-    pieces = _grown(view, _components(smooth, core), risen)
+    pieces = _grown(view, find_components(smooth, core), risen)
     # what has no core, such as a pen, is a piece of its own
-    thin = _components(smooth, risen & (pieces == 0))
+    thin = find_components(smooth, risen & (pieces == 0))
     pieces = torch.where((pieces == 0) & (thin > 0), pieces.max() + thin, pieces)
     sure = core | (thin > 0)
     pieces = torch.where(_are_things(view, pieces, sure)[pieces], pieces, 0)
@@ -168,7 +168,7 @@ def _jumps(smooth: TableImage) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]
     return farthest - depth > smooth.jump, depth - nearest > smooth.jump
 
 
-def _components(smooth: TableImage, core: Tensor) -> Int[Tensor, "h w"]:
+def find_components(smooth: TableImage, core: Tensor) -> Int[Tensor, "h w"]:
     """Return the number, from 1, of each pixel's connected component in the mask `core`; 0 outside
     of the mask.
     """
