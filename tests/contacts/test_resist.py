@@ -17,18 +17,18 @@ SPEC = ContactSpec()
 PLACE = real([1.0, 2.0, 0.5])
 
 
-def wrench_matrix(points, normals):
+def wrench_matrix(points, normals, friction=SPEC.planned_friction):
     """Wrenches (6, f e) about the origin of the forces along the cones' edges, with normal parts of
     1 N.
     """
-    edges = cone_edges(
-        normals[None], tangents(points[None], normals[None]), SPEC.planned_friction, SPEC.edges
-    )[0]
+    edges = cone_edges(normals[None], tangents(points[None], normals[None]), friction, SPEC.edges)[
+        0
+    ]
     return np.concatenate([edges, np.cross(points[:, None], edges)], -1).reshape(-1, 6).T
 
 
-def by_highs(points, normals, strength, load) -> float:
-    matrix = wrench_matrix(points, normals)
+def by_highs(points, normals, strength, load, friction=SPEC.planned_friction) -> float:
+    matrix = wrench_matrix(points, normals, friction)
     f = len(points)
     most = np.zeros((f, matrix.shape[1] + 1))
     for contact in range(f):

@@ -26,10 +26,14 @@ from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.attempts import assign
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
 from torchgrasp.planner.objects import join_objects, pose_request
+from torchgrasp.planner.ranking import UNCARRIED, predict
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.rows import draw, find_candidates, with_costs
 from torchgrasp.success import TaskWrenches
-from torchgrasp.success.task import loads_of
+from torchgrasp.success.features import measure_grasps
+from torchgrasp.success.loads import strength_of
+from torchgrasp.success.model import load_success_model
+from torchgrasp.success.task import Conditions, loads_of
 
 HAND = load_hand("allegro")
 VIEW = load_object("jug").view
@@ -213,3 +217,54 @@ def test_contact_sets_and_postures_that_resist_the_worst_load_come_first(steered
     good = torch.stack([margin[0] == 1 for margin in of_sets])
     assert 0 < int(good.sum()) < len(good)
     assert float(cost[good].max()) < float(cost[~good].min())
+
+
+@pytest.mark.parametrize("lift", [True, False])
+def test_a_lift_is_less_likely_where_no_forces_with_all_friction_carry_the_weight(lift):
+    mass = 0.9
+    spec = ContactSpec(table=0.0)
+    task = GraspTask(mass, lift=lift)
+    objects = pose_request(Request(VIEW, HAND, spec, 30, task=task), HAND)
+    grasps = plan_grasps(VIEW, HAND, spec, 30, task=task)
+    grasps = move(grasps[grasps.status == Status.OK], inverse(objects.each[0].obj_from_upright))
+    cloud = torch.zeros(len(grasps), dtype=torch.int64)
+    found = predict(objects, grasps, cloud)[0]
+    alone = model_alone(objects, grasps)
+    centre = objects.body.center.double()
+    weight = real([0.0, 0.0, -9.81 * mass])
+    load = torch.cat([weight, torch.linalg.cross(centre, weight)]).numpy()
+    strength = strength_of(HAND, grasps, grasps.contacts, 15.0).double().numpy()
+    rows = zip(
+        grasps.contacts.points.double(), grasps.contacts.normals.double(), strength, strict=True
+    )
+    carried = torch.tensor([by_highs(*row, load, spec.mean_friction) >= 1 for row in rows])
+    assert 0 < int(carried.sum()) < len(carried)
+    expected = alone - UNCARRIED * (~carried & lift)
+    torch.testing.assert_close(found, expected)
+
+
+def model_alone(objects, grasps):
+    """The log-odds of the success model, which knows no statics."""
+    task = objects.request.grasp_task
+    conditions = Conditions.of(objects.spec.friction, task.mass)
+    lifts = task.lifts(objects.spec.plane)
+    features = measure_grasps(HAND, objects.body, grasps, conditions, task, lifts)
+    return load_success_model().mean_log_odds(features, conditions.weights)
+
+
+def test_contact_sets_that_carry_a_lifted_weight_come_first():
+    mass = 0.9
+    spec = ContactSpec(table=0.0)
+    objects = pose_request(Request(VIEW, HAND, spec, 40, task=GraspTask(mass)), HAND)
+    sizes = [size.starts for size in objects.sizes if size.starts]
+    plan, owner = next(draw(objects, sizes))
+    found = with_costs(objects, find_candidates(objects, plan, owner, 1000, lambda *_, **__: None))
+    contacts = assign(found.contacts, found.seeds)
+    strength = strength_of(HAND, found.seeds, contacts, 15.0).numpy()
+    weight = real([0.0, 0.0, -9.81 * mass])
+    load = torch.cat([weight, torch.linalg.cross(objects.body.center.double(), weight)]).numpy()
+    rows = zip(contacts.points, contacts.normals, strength, strict=True)
+    margins = real([by_highs(*row, load, spec.mean_friction) for row in rows])
+    good = torch.stack([margins[found.seeds.row == row].max() >= 1 for row in range(len(found))])
+    assert 0 < int(good.sum()) < len(good)
+    assert float(found.cost[good].max()) < float(found.cost[~good].min())

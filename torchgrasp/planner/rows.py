@@ -26,7 +26,7 @@ from torchgrasp.ik.attempts import assign, seed_costs
 from torchgrasp.ik.seeds import nearest_postures, query_mixture
 from torchgrasp.planner.objects import CloudIndex, Objects
 from torchgrasp.posture_model.mixture import PAPER_ENERGY
-from torchgrasp.success.loads import lever_arm, strength_of
+from torchgrasp.success.loads import lever_arm
 from torchgrasp.values.planning import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
 
 
@@ -75,7 +75,8 @@ class Candidates:
         certificate: the proofs of force closure.
         seeds: initial hand postures; `seeds.row` is the index of each one's contact set.
         load: of the task's wrenches [N, N m] about the centroid of the contacts, the one that needs
-            the largest share of the greatest finger forces; 0 without loads.
+            the largest share of the greatest finger forces. Without loads the weight in a lift, else
+            0.
         cost: cost (no unit; less is better) by which the next contact sets to try are chosen.
         cloud: index of each contact set's object.
         status: a `Row` for each contact set.
@@ -253,8 +254,11 @@ def find_candidates(
     """
     request = objects.request
     load = plan.contacts.points.new_zeros(len(plan), 6)
+    weight = objects.weight_on(plan.contacts, cloud)
     if objects.loads is not None:
         plan, load = _drop_weak(objects, plan, cloud, load)
+    elif weight is not None:
+        load = weight
     note("plan", plan)
     if request.mode == "paper" and request.order == "variance":
         variance = plan.contacts.variance
@@ -337,20 +341,20 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     the least of the `seed_costs` [mm2] of the set's first `CHOICE.tried` initial postures, infinite
     if it has none, and a its lever arm (`lever_arm`).
 
-    With loads to resist, the initial postures of each set are first sorted by the share of the load
-    that they resist, at most 1, the greatest share first. A set whose postures all resist less than
-    the load costs from `CHOICE.weak` to 2 `CHOICE.weak` more.
+    With loads to resist, or a weight to lift, the initial postures of each set are first sorted by
+    the share of the load that they carry, at most 1, the greatest share first. A set whose postures
+    all carry less than the load costs from `CHOICE.weak` to 2 `CHOICE.weak` more. A weight meets
+    all of the mean friction: without it, two fingers at a thin wall and one on the floor of a pan
+    would do.
     """
     contacts = found.contacts
     seeds = found.seeds
     weak = torch.zeros_like(found.certificate.margin)
-    if objects.loads is not None:
-        touched = assign(contacts, seeds)
-        strength = strength_of(objects.hand, seeds, touched, objects.strongest)
-        arms = touched.points - touched.points.mean(1, keepdim=True)
-        load = found.load[seeds.row, None]
-        proof = resist_loads(arms, touched.normals, strength, load, objects.spec)
-        share = proof.margin.clamp(max=1)
+    lifted = objects.request.grasp_task.lifts(objects.spec.plane)
+    if lifted or objects.loads is not None:
+        spec = objects.slipping if objects.loads is None else objects.spec
+        load = found.load[seeds.row]
+        share = objects.share_carried(seeds, assign(contacts, seeds), load, spec)
         weak = weak.scatter_reduce(0, seeds.row, share, "amax")
         weak = torch.where(weak < 1, CHOICE.weak * (2 - weak), 0.0)
         seeds = seeds[lexical_order(seeds.row, -share)]
