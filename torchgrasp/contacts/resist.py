@@ -27,6 +27,7 @@ from torchgrasp.contacts.form_closure import (
 )
 from torchgrasp.foundation.base import row_numbers
 from torchgrasp.geometry.linalg import dot
+from torchgrasp.values.planning import Contacts
 from torchgrasp.values.specs import ContactSpec
 
 
@@ -85,6 +86,24 @@ def resist_loads(
     worst = margin.view(-1, count).argmin(1)
     row = torch.arange(len(points), device=worst.device) * count + worst
     return Resisted(margin[row], about.flatten(0, 1)[row], twist[row] / unit[:, 0], forces[row])
+
+
+def share_carried(
+    contacts: Contacts,
+    strength: Float[Tensor, "b f"],
+    load: Float[Tensor, "b 6"],
+    spec: ContactSpec,
+) -> Float[Tensor, "b"]:
+    """Return which share, at most 1, of a load each of b contact sets can carry.
+
+    Args:
+        contacts: the contact sets.
+        strength: greatest normal force [N] of each contact.
+        load: force [N], then torque [N m] about the centroid of the contacts.
+        spec: its `planned_friction` and `edges` define the friction cones.
+    """
+    arms = contacts.points - contacts.points.mean(1, keepdim=True)
+    return resist_loads(arms, contacts.normals, strength, load[:, None], spec).margin.clamp(max=1)
 
 
 def _solve(

@@ -22,7 +22,6 @@ from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
 from torchgrasp.contacts.region import seen_from
-from torchgrasp.contacts.resist import resist_loads
 from torchgrasp.contacts.starts import (
     check_starts,
     drawn_starts,
@@ -55,11 +54,10 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import Mesh, collision_field, extract_mesh
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import GRIP, MEASURES
-from torchgrasp.success.loads import strength_of
 from torchgrasp.success.promise import describe_promise
 from torchgrasp.success.task import loads_of
 from torchgrasp.values.distribution import Distribution
-from torchgrasp.values.planning import Certificate, Contacts, Grasps, IKSeeds, PointCloud
+from torchgrasp.values.planning import Certificate, Contacts, Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 
 TARGET_POINTS = 1000
@@ -219,23 +217,6 @@ class Objects:
         force = torch.zeros_like(arm)
         force[:, 2] = -MEASURES.gravity * Distribution.of(task.mass).mean
         return torch.cat([force, torch.linalg.cross(arm, force)], -1)
-
-    def share_carried(
-        self,
-        held: Grasps | IKSeeds,
-        contacts: Contacts,
-        load: Float[Tensor, "b 6"],
-        spec: ContactSpec,
-    ) -> Float[Tensor, "b"]:
-        """Return which share, at most 1, of a load the fingers of each of b postures can carry.
-
-        `held` has the postures, `contacts` are those of the fingers, and `load` acts about their
-        centroids. The friction is the planned one of `spec`.
-        """
-        strength = strength_of(self.hand, held, contacts, self.strongest)
-        arms = contacts.points - contacts.points.mean(1, keepdim=True)
-        proof = resist_loads(arms, contacts.normals, strength, load[:, None], spec)
-        return proof.margin.clamp(max=1)
 
     @property
     def library(self) -> PostureLibrary:

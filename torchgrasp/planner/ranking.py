@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.contacts.resist import resist_loads
+from torchgrasp.contacts.resist import resist_loads, share_carried
 from torchgrasp.foundation.base import join
 from torchgrasp.foundation.errors import Status
 from torchgrasp.ik.motion import collision_probability
@@ -94,7 +94,8 @@ def predict(
     log_odds = model.mean_log_odds(features, conditions.weights)
     weight = objects.weight_on(grasps.contacts, cloud)
     if weight is not None:
-        carried = objects.share_carried(grasps, grasps.contacts, weight, objects.slipping)
+        strength = strength_of(objects.hand, grasps, grasps.contacts, objects.strongest)
+        carried = share_carried(grasps.contacts, strength, weight, objects.slipping)
         log_odds = log_odds - UNCARRIED * (carried < 1)
     obstacles = objects.world.obstacles
     if obstacles is not None:

@@ -15,9 +15,9 @@ from torch import Tensor
 from torchgrasp.contacts.certify import certify
 from torchgrasp.contacts.plan import plan_chunk, stages_for
 from torchgrasp.contacts.problem import rows_of
-from torchgrasp.contacts.resist import resist_loads
+from torchgrasp.contacts.resist import resist_loads, share_carried
 from torchgrasp.contacts.starts import STARTS_PER_CHUNK
-from torchgrasp.foundation.base import at_once, join, lexical_order, rank_in_group
+from torchgrasp.foundation.base import at_once, flatnonzero, join, lexical_order, rank_in_group
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import Count
@@ -26,8 +26,9 @@ from torchgrasp.ik.attempts import assign, seed_costs
 from torchgrasp.ik.seeds import nearest_postures, query_mixture
 from torchgrasp.planner.objects import CloudIndex, Objects
 from torchgrasp.posture_model.mixture import PAPER_ENERGY
-from torchgrasp.success.loads import lever_arm
+from torchgrasp.success.loads import lever_arm, strength_of
 from torchgrasp.values.planning import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
+from torchgrasp.values.specs import ContactSpec
 
 
 class Row(enum.IntEnum):
@@ -353,8 +354,7 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     lifted = objects.request.grasp_task.lifts(objects.spec.plane)
     if lifted or objects.loads is not None:
         spec = objects.slipping if objects.loads is None else objects.spec
-        load = found.load[seeds.row]
-        share = objects.share_carried(seeds, assign(contacts, seeds), load, spec)
+        share = _share_carried(objects, found, spec)
         weak = weak.scatter_reduce(0, seeds.row, share, "amax")
         weak = torch.where(weak < 1, CHOICE.weak * (2 - weak), 0.0)
         seeds = seeds[lexical_order(seeds.row, -share)]
@@ -367,6 +367,27 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     missed = least.clamp_min(CHOICE.touching).log()
     cost = missed + CHOICE.lever * (arm + CHOICE.short).log() + weak
     return dataclasses.replace(found, seeds=seeds, cost=cost)
+
+
+def _share_carried(objects: Objects, found: Candidates, spec: ContactSpec) -> Float[Tensor, "g"]:
+    """Return which share of its set's load, at most 1, the fingers of each initial posture can
+    carry.
+
+    A set that carries its load with the least strength of its postures at each contact carries it
+    in all of them: most sets need one linear programme.
+    """
+    contacts = found.contacts
+    seeds = found.seeds
+    strength = strength_of(objects.hand, seeds, assign(contacts, seeds), objects.strongest)
+    at_contact = torch.empty_like(strength).scatter(1, seeds.permutation, strength)
+    least = strength.new_full(contacts.points.shape[:2], objects.strongest)
+    rows = seeds.row[:, None].expand_as(at_contact)
+    least = least.scatter_reduce(0, rows, at_contact, "amin")
+    share = share_carried(contacts, least, found.load, spec)[seeds.row]
+    doubtful = flatnonzero(share < 1)
+    own = seeds.row[doubtful]
+    share[doubtful] = share_carried(contacts[own], at_contact[doubtful], found.load[own], spec)
+    return share
 
 
 def choose(rows: Candidates, most: int, clouds: int) -> Int[Tensor, "k"]:
