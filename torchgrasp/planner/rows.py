@@ -384,6 +384,7 @@ def _share_carried(objects: Objects, found: Candidates, spec: ContactSpec) -> Fl
     rows = seeds.row[:, None].expand_as(at_contact)
     least = least.scatter_reduce(0, rows, at_contact, "amin")
     share = share_carried(contacts, least, found.load, spec)[seeds.row]
+    # one wait for the device saves a programme for each of the other postures
     doubtful = flatnonzero(share < 1)
     own = seeds.row[doubtful]
     share[doubtful] = share_carried(contacts[own], at_contact[doubtful], found.load[own], spec)
