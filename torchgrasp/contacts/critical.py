@@ -13,13 +13,15 @@ linear map M_i, for which x_i = M_i f_i, the best forces satisfy
 
 The twist y is a motion of the object, along which friction of the coefficient mu just stops all
 contacts. Newton's method with the scaling of Nesterov and Todd [1] solves the equations for falling
-nu. The three numbers of a contact scale as the cone itself does. With the scaling point w of x and
-s, D = (2 J w w^T J - J) / beta maps x to s. Its inverse is beta (2 w w^T - J).
+nu. In a frame of the contact, whose first axis is the inward normal, M_i is diag(mu, 1, 1), and the
+form of the cone is J = diag(1, -1, -1). With the scaling point w of x and s, the matrix
+D = (2 J w w^T J - J) / beta maps x to s. Its inverse is beta (2 w w^T - J).
 
 [1] Andersen, Roos and Terlaky, Mathematical Programming 95, 2003.
 """
 
 import dataclasses
+import functools
 from typing import Annotated, Any, NamedTuple
 
 import torch
@@ -27,14 +29,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.contacts.balance import grasp_map
-from torchgrasp.contacts.form_closure import Vectors, scaled_arms
+from torchgrasp.contacts.form_closure import Vectors, scaled_arms, with_torque
 from torchgrasp.foundation.base import FINGERTIPS, flatnonzero, row_numbers
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
-from torchgrasp.geometry.linalg import eye_like, matvec, norm
+from torchgrasp.geometry.linalg import across, dot, eye_like, matvec, norm
 from torchgrasp.shape.kernel import is_plain
 
 
@@ -46,7 +48,7 @@ class CriticalNumbers:
     """Greatest friction coefficient; contacts that need more count as unable to balance."""
     exact: float = 1e-6
     """The last nu: the result is larger than the critical friction by about 2 nu a contact."""
-    steps: int = 40
+    steps: int = 50
     """Most steps; most contact sets need fewer than 15."""
     first: float = 1.5
     """The first friction coefficient, as a multiple of what the first forces need."""
@@ -97,15 +99,6 @@ class LeastBalance(NamedTuple):
     slide: Vectors
     twist: Float[Tensor, "b 6"]
     scale: Float[Tensor, "b"]
-
-    def plus(self, other: "LeastBalance", share: Float[Tensor, "b"]) -> "LeastBalance":
-        """Return the sum of this one and a share of the other one."""
-        shares = [share.reshape(-1, *[1] * (x.ndim - 1)) for x in self]
-        return LeastBalance(*(x + s * d for x, s, d in zip(self, shares, other, strict=True)))
-
-    def rows(self, rows: Tensor) -> "LeastBalance":
-        """Return some of the rows."""
-        return LeastBalance(*(x[rows] for x in self))
 
 
 @checked(gradients=True)
@@ -192,9 +185,9 @@ def _follow(
     """Return the same balances, with their derivatives by points, normals and load."""
     # Newton's steps at the solution change the derivatives alone: the first step those of first
     # order, the second step those of second order.
-    cones = _Cones.of(points, normals, load)
+    equations = _Equations.of(points, normals, load)
     for _ in range(2):
-        found = cones.refined(found)
+        found = equations.refined(found)
     return found
 
 
@@ -216,8 +209,6 @@ class _Search(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         """Return the mask and the fields for all contact sets."""
         rows, found = _search(points, normals, load)
-        for _ in range(CRITICAL.polishing):
-            found = _Cones.of(points[rows], normals[rows], load[rows]).nearer(found)
         good = torch.zeros_like(load[:, 0], dtype=torch.bool).index_fill(0, rows, True)
         parts = (x.new_full((len(good), *x.shape[1:]), torch.nan) for x in found)
         return good, *(x.index_copy(0, rows, y) for x, y in zip(parts, found, strict=True))
@@ -259,56 +250,294 @@ def _search(
     finite = torch.isfinite(points) & torch.isfinite(normals)
     finite = finite.flatten(1).all(1) & torch.isfinite(load).all(1)
     left = flatnonzero(finite & ~degenerate(points))
-    cones = _Cones.of(points[left], normals[left], load[left])
+    axes = torch.stack([-normals, *across(normals)], 2)  # (b, f, 3 axes, 3)
+    every = _Cones.of(points, axes, load)
+    cones = every.some(left)
     at = cones.first()
-    whole = points.new_ones(len(left))
-    shorter = whole.new_tensor(numbers.shorter)
-    last = whole
+    last = torch.ones_like(at.friction)
+    shorter = last.new_tensor(numbers.shorter)[:, None]
     found_rows = list[Tensor]()
-    found = list[LeastBalance]()
+    found = list[_Balance]()
     for _ in range(numbers.steps):
         held = last < numbers.short
-        still, centring = cones.directions(at, held)
-        mean = cones.products(at).mean(1)
-        undone = (1 - cones.longest(at, still)).clamp(0, 1)
+        scaling = _Scaling.of(at, cones.flip)
+        still, centring = cones.directions(at, scaling, held)
+        mean = _sum(scaling.products(), 0) / (2 * points.shape[1])
+        undone = (1 - scaling.longest(still)).clamp(0, 1)
         kept = torch.where(held, 1.0, undone**numbers.power)
         target = (kept * mean).clamp_min(numbers.exact)
         change = still.plus(centring, target)
-        share = (numbers.within * cones.longest(at, change)).clamp_max(1)
-        tried = share[:, None] * shorter
-        inside = cones.inside(at, change, tried)
-        share = tried.gather(1, inside.double().argmax(1, keepdim=True))[:, 0]
-        at = at.plus(change, share)
+        share = (numbers.within * scaling.longest(change)).clamp_max(1)
+        tried = share * shorter  # (s, b)
+        inside = at.inside(change, tried)
+        share = tried.gather(0, inside.double().argmax(0, keepdim=True))[0]
+        at = at.after(change, share)
         stuck = held & (share < numbers.stuck)
         at = at._replace(friction=torch.where(stuck, numbers.raised, 1.0) * at.friction)
-        off = ((cones.split(at.forces)[0] * at.press).sum(1) - 1).abs()
+        off = (_sum(at.forces[0] * at.multipliers[0], 0) - 1).abs()
         settled = (share == 1) & (target == numbers.exact) & (off <= numbers.off)
         last = share
         lost = ~(at.friction < 2 * numbers.most)
         going = flatnonzero(~(settled | lost))
         if len(going) == len(last):
             continue
-        ended = flatnonzero(settled & (cones.resultant(at) <= numbers.rounding))
+        ended = flatnonzero(settled & (norm(cones.total(at.forces).T) <= numbers.rounding))
         found_rows.append(left[ended])
-        found.append(at.rows(ended))
+        found.append(at.some(ended))
         left = left[going]
-        at = at.rows(going)
-        cones = _Cones(*(x[going] for x in cones))
+        at = at.some(going)
+        cones = cones.some(going)
         last = last[going]
         if len(left) == 0:
             break
     found_rows.append(left[:0])
-    found.append(at.rows(left[:0]))
+    found.append(at.some(left[:0]))
     rows = torch.cat(found_rows)
-    joined = LeastBalance(*(torch.cat(x) for x in zip(*found, strict=True)))
+    at = _Balance(*(torch.cat(x, -1) for x in zip(*found, strict=True)))
     order = torch.argsort(rows)
-    order = order[joined.friction[order] <= numbers.most]
-    return rows[order], joined.rows(order)
+    order = order[at.friction[order] <= numbers.most]
+    rows = rows[order]
+    at = at.some(order)
+    cones = every.some(rows)
+    for _ in range(numbers.polishing):
+        at = cones.nearer(at)
+    return rows, at.along(axes[rows])
+
+
+class _Change(NamedTuple):
+    """A change of balances.
+
+    The b contact sets are the last axis, here and below, since sums over short axes are then fast.
+
+    Args:
+        forces: change of the forces (3, f, b) in the frames of the contacts.
+        cones: change of x and s (2, 3, f, b), that of x to first order.
+        friction: change of mu (b,).
+        motion: change of the twist y and the multiplier l (7, b).
+    """
+
+    forces: Float[Tensor, "3 f b"]
+    cones: Float[Tensor, "2 3 f b"]
+    friction: Float[Tensor, "b"]
+    motion: Float[Tensor, "7 b"]
+
+    def plus(self, other: "_Change", share: Float[Tensor, "b"]) -> "_Change":
+        """Return the sum of this one and a share of the other one."""
+        return _Change(*(x + share * d for x, d in zip(self, other, strict=True)))
+
+
+class _Balance(NamedTuple):
+    """Forces of b contact sets on the way to balance, and their multipliers.
+
+    Args:
+        forces: forces (3, f, b) in the frames of the contacts.
+        multipliers: the multipliers s of the cones (3, f, b).
+        friction: the friction coefficient mu (b,).
+        motion: the twist y and the multiplier l (7, b).
+    """
+
+    forces: Float[Tensor, "3 f b"]
+    multipliers: Float[Tensor, "3 f b"]
+    friction: Float[Tensor, "b"]
+    motion: Float[Tensor, "7 b"]
+
+    def some(self, sets: Int[Tensor, "k"]) -> "_Balance":
+        """Return those of some contact sets."""
+        return _Balance(*(x.index_select(-1, sets) for x in self))
+
+    def inside(self, change: _Change, shares: Float[Tensor, "s b"]) -> Bool[Tensor, "s b"]:
+        """Return for each of s shares of a change whether the forces stay in the cones."""
+        forces = self.forces + shares[:, None, None] * change.forces  # (s, 3, f, b)
+        friction = self.friction + shares * change.friction
+        push = forces[:, 0]
+        good = (push > 0) & ((friction[:, None] * push) ** 2 > (forces[:, 1:] ** 2).sum(1))
+        return good.all(1) & (friction > 0)
+
+    def after(self, change: _Change, share: Float[Tensor, "b"]) -> "_Balance":
+        """Return the balance after a share of a change."""
+        forces = self.forces + share * change.forces
+        multipliers = self.multipliers + share * change.cones[1]
+        friction = self.friction + share * change.friction
+        motion = self.motion + share * change.motion
+        return _Balance(forces, multipliers, friction, motion)
+
+    def along(self, axes: Float[Tensor, "b f 3 3"]) -> LeastBalance:
+        """Return the balance for the axes (a, b, c) of the contacts."""
+        press = self.multipliers[0].T
+        forces, slide = (
+            (x.permute(2, 1, 0)[..., None] * axes).sum(2) for x in (self.forces, self.multipliers)
+        )
+        slide = slide - press[..., None] * axes[:, :, 0]
+        twist, scale = self.motion.T.split([6, 1], 1)
+        return LeastBalance(forces, self.friction, press, slide, twist, scale[:, 0])
+
+
+class _Scaling(NamedTuple):
+    """The points x and s of the cones, whose scaling gives Newton's step.
+
+    Args:
+        stretch: the diagonals of M (3, 1, b).
+        flip: the diagonal of J (3, 1, 1).
+        cones: x and s (2, 3, f, b).
+        flipped: J x and J s (2, 3, f, b).
+        form: x^T J x and s^T J s (2, f, b), which are positive inside the cones.
+    """
+
+    stretch: Float[Tensor, "3 1 b"]
+    flip: Float[Tensor, "3 1 1"]
+    cones: Float[Tensor, "2 3 f b"]
+    flipped: Float[Tensor, "2 3 f b"]
+    form: Float[Tensor, "2 f b"]
+
+    @classmethod
+    def of(cls, at: _Balance, flip: Float[Tensor, "3 1 1"]) -> "_Scaling":
+        """Return the points of a balance."""
+        one = torch.ones_like(at.friction)
+        stretch = torch.stack([at.friction, one, one])[:, None]
+        cones = torch.stack([stretch * at.forces, at.multipliers])
+        flipped = flip * cones
+        return cls(stretch, flip, cones, flipped, (cones * flipped).sum(1))
+
+    def products(self) -> Float[Tensor, "f b"]:
+        """Return x . s, which is 2 nu."""
+        x, s = self.cones
+        return (x * s).sum(0)
+
+    def longest(self, change: _Change) -> Float[Tensor, "b"]:
+        """Return the largest share of a change for which all x and s stay in their cones, to first
+        order.
+        """
+        along = (self.flipped * change.cones).sum(1)
+        bend = (self.flip * change.cones**2).sum(1)
+        root = (along**2 - self.form * bend).clamp_min(0).sqrt()
+        return 1 / ((root - along) / self.form).amax((0, 1)).clamp_min(0)
 
 
 class _Cones(NamedTuple):
-    """The friction cones of b contact sets: the normals, the rows of G and of the sum of normal
-    forces (b, 7, f, 3), and the load that the forces balance.
+    """The friction cones of b contact sets, and the eight equations of balance and sums.
+
+    Args:
+        rows: the rows of G and of the sum of normal forces (7, 3, f, b), for forces in the frames
+            of the contacts.
+        constants: the constants of the equations (8, b): the load, the number of contacts, and 1
+            for sum a_i s_i0.
+        flip: the diagonal of J (3, 1, 1).
+    """
+
+    rows: Float[Tensor, "7 3 f b"]
+    constants: Float[Tensor, "8 b"]
+    flip: Float[Tensor, "3 1 1"]
+
+    @classmethod
+    def of(
+        cls, points: Vectors, axes: Float[Tensor, "b f 3 3"], load: Float[Tensor, "b 6"]
+    ) -> "_Cones":
+        """Return the cones of contacts with the given axes."""
+        arms = scaled_arms(points)[:, :, None].expand_as(axes)
+        grasp = with_torque(axes, arms).permute(3, 2, 1, 0)  # (6, 3, f, b)
+        first = eye_like(3, points)[0][:, None, None]
+        rows = torch.cat([grasp, -first.expand_as(grasp[:1])])
+        one = torch.ones_like(load[:, 0])
+        constants = torch.stack([*load.T, points.shape[1] * one, one])
+        return cls(rows, constants, 2 * first - 1)
+
+    def some(self, sets: Int[Tensor, "k"]) -> "_Cones":
+        """Return those of some contact sets."""
+        rows, constants = (x.index_select(-1, sets) for x in (self.rows, self.constants))
+        return _Cones(rows, constants, self.flip)
+
+    def first(self) -> _Balance:
+        """Return the start: equal pushes, made to balance where they then push everywhere."""
+        numbers = CRITICAL
+        equal = -self.rows[6]
+        grasp = self.rows[:6]
+        gram = _products(grasp, grasp)
+        needed = _solved(gram, self.total(equal)[:, None])
+        balanced = equal - _sum(needed[:, :, None] * grasp, 0)
+        pushes = (balanced[0] > numbers.pushing).all(0)
+        forces = torch.where(pushes, balanced, equal)
+        forces = self.constants[6] / _sum(forces[0], 0) * forces
+        push = forces[0]
+        ratio = (forces[1:] ** 2).sum(0).sqrt() / push
+        friction = numbers.first * ratio.amax(0) + numbers.above
+        x = torch.cat([friction * forces[:1], forces[1:]])
+        flipped = self.flip * x
+        inverse = flipped / (x * flipped).sum(0)
+        nu = 1 / _sum(push * inverse[0], 0)
+        motion = torch.stack([*torch.zeros_like(self.constants[:6]), -2 * nu])
+        return _Balance(forces, nu * inverse, friction, motion)
+
+    def total(self, forces: Float[Tensor, "3 f b"]) -> Float[Tensor, "6 b"]:
+        """Return the total wrench of forces and load."""
+        return _by_row(self.rows[:6] * forces) + self.constants[:6]
+
+    def nearer(self, at: _Balance) -> _Balance:
+        """Return the balance after a whole step to the last nu, or the same one if the step would
+        leave a cone, as on a kink.
+        """
+        whole = torch.ones_like(at.friction)
+        scaling = _Scaling.of(at, self.flip)
+        still, centring = self.directions(at, scaling, whole < 1)
+        change = still.plus(centring, CRITICAL.exact * whole)
+        stays = at.inside(change, whole[None])[0] & (scaling.longest(change) > 1)
+        return at.after(change, stays.to(whole))
+
+    def directions(
+        self, at: _Balance, scaling: _Scaling, held: Bool[Tensor, "b"]
+    ) -> tuple[_Change, _Change]:
+        """Return Newton's step to nu = 0, and its change for each unit of nu.
+
+        The friction does not change where `held`. Forces and cone multipliers are eliminated: the
+        eight unknowns left are the twist, the scale and the friction.
+        """
+        stretch, flip, (x, s), flipped, form = scaling
+        push = at.forces[0]
+        inverse_x, inverse_s = flipped / form[:, None]
+        size_x, size_s = form.sqrt()
+        beta = size_x / size_s
+        gain = 1 + scaling.products() / (size_x * size_s)
+        point = x / size_x + flipped[1] / size_s  # w sqrt(2 gain)
+        stiff = flip * point / (beta * gain).sqrt()  # D = stiff stiff^T - J / beta
+        soft = point * (beta / gain).sqrt() / stretch
+        plain = flip * beta / stretch**2
+
+        def softened(z: Float[Tensor, "*c 3 f b"]) -> Float[Tensor, "*c 3 f b"]:
+            """Return products with M^-1 D^-1 M^-1."""
+            return (z * soft).sum(-3, keepdim=True) * soft - plain * z
+
+        by_friction = stretch * push * stiff[0] * stiff
+        by_friction[0] -= s[0] + x[0] / beta
+        by_friction = torch.where(held, 0.0, by_friction)
+        rows = torch.cat([self.rows, by_friction[None]])  # (8, 3, f, b)
+        soft_rows = softened(rows)
+        matrix = _products(rows, soft_rows)
+        matrix[7, 7] -= _sum(push**2 * (stiff[0] ** 2 - 1 / beta), 0)
+        # what the forces would be if the eight unknowns did not change, and for each unit of nu
+        lacking = stretch * s - _sum(self.rows * at.motion[:, None, None], 0)
+        free = torch.stack([softened(lacking), inverse_s / stretch])  # (2, 3, f, b)
+        right = _by_row(rows[:, None] * free)  # (8, 2, b)
+        right[:, 0] += self.constants
+        right[7, 1] -= _sum(push * inverse_x[0], 0)
+        right[7] = torch.where(held, 0.0, right[7])
+        solved = _solved(matrix, right)
+        forces = free - _sum(soft_rows[:, None] * solved[:, :, None, None], 0)
+        forces[0] -= at.forces
+        friction = solved[7]
+        # the change of s follows from that of x
+        of_x = stretch * forces
+        of_x[:, 0] += push * friction[:, None]
+        of_s = flip / beta * of_x - (stiff * of_x).sum(1, keepdim=True) * stiff
+        of_s[0] -= s
+        of_s[1] += inverse_x
+        cones = torch.stack([of_x, of_s], 1)
+        parts = zip(forces, cones, friction, solved[:7].unbind(1), strict=True)
+        still, centring = (_Change(*x) for x in parts)
+        return still, centring
+
+
+class _Equations(NamedTuple):
+    """The equations of balances, for their derivatives: the normals, the rows of G and of the sum
+    of normal forces (b, 7, f, 3), and the load that the forces balance.
     """
 
     normals: Vectors
@@ -316,89 +545,15 @@ class _Cones(NamedTuple):
     load: Float[Tensor, "b 6"]
 
     @classmethod
-    def of(cls, points: Vectors, normals: Vectors, load: Float[Tensor, "b 6"]) -> "_Cones":
-        """Return the cones of contacts."""
+    def of(cls, points: Vectors, normals: Vectors, load: Float[Tensor, "b 6"]) -> "_Equations":
+        """Return the equations of contacts."""
         balance = grasp_map(scaled_arms(points)).unflatten(2, (-1, 3))
         return cls(normals, torch.cat([balance, normals[:, None]], 1), load)
-
-    def first(self) -> LeastBalance:
-        """Return the start: equal pushes, made to balance where they then push everywhere."""
-        numbers = CRITICAL
-        n = self.normals
-        b, f, _ = n.shape
-        grasp = self.rows[:, :6].flatten(2)
-        total = self.load[..., None] - grasp @ n.flatten(1)[..., None]
-        needed, _ = torch.linalg.solve_ex(grasp @ grasp.mT, total)
-        balanced = -n - (grasp.mT @ needed)[..., 0].view(b, f, 3)
-        pushes = (-_dot(balanced, n) > numbers.pushing).all(1)[:, None, None]
-        forces = torch.where(pushes, balanced, -n)
-        forces = forces * (f / -_dot(forces, n).sum(1))[:, None, None]
-        push, tangential = self.split(forces)
-        friction = (
-            numbers.first * (_dot(tangential, tangential).sqrt() / push).amax(1) + numbers.above
-        )
-        ahead = friction[:, None] * push
-        press = ahead / _form(ahead, tangential)
-        slide = -tangential / _form(ahead, tangential)[..., None]
-        nu = 1 / (press * push).sum(1)
-        slide = nu[:, None, None] * slide
-        twist = n.new_zeros(b, 6)
-        return LeastBalance(forces, friction, nu[:, None] * press, slide, twist, -2 * nu)
-
-    def split(self, forces: Float[Tensor, "*b f 3"]) -> tuple[Tensor, Tensor]:
-        """Return normal and tangential parts of forces."""
-        push = -_dot(forces, self.normals)
-        return push, forces + push[..., None] * self.normals
-
-    def products(self, at: LeastBalance) -> Float[Tensor, "b f"]:
-        """Return half of x_i . s_i, the nu of each contact."""
-        push, tangential = self.split(at.forces)
-        return (at.friction[:, None] * push * at.press + _dot(tangential, at.slide)) / 2
-
-    def resultant(self, at: LeastBalance) -> Float[Tensor, "b"]:
-        """Return the length of the total wrench of forces and load."""
-        return norm(matvec(self.rows[:, :6].flatten(2), at.forces.flatten(1)) + self.load)
-
-    def longest(self, at: LeastBalance, change: LeastBalance) -> Float[Tensor, "b"]:
-        """Return the largest share of a change for which all x_i and s_i stay in their cones, to
-        first order.
-        """
-        push, tangential = self.split(at.forces)
-        more, across = self.split(change.forces)
-        friction = at.friction[:, None]
-        ahead = friction * more + change.friction[:, None] * push
-        first = _way(friction * push, tangential, ahead, across)
-        second = _way(at.press, at.slide, change.press, change.slide)
-        return torch.minimum(first, second).amin(1)
-
-    def inside(
-        self, at: LeastBalance, change: LeastBalance, shares: Float[Tensor, "b s"]
-    ) -> Bool[Tensor, "b s"]:
-        """Return for each of s shares of a change whether the forces stay in the cones."""
-        push, tangential = self.split(at.forces)
-        more, across = self.split(change.forces)
-        share = shares[..., None]  # (b, s, 1)
-        normal = push[:, None] + share * more[:, None]
-        crossed, squared = (_dot(x, across)[:, None] for x in (tangential, across))
-        sideways = _dot(tangential, tangential)[:, None] + share * (2 * crossed + share * squared)
-        friction = at.friction[:, None] + shares * change.friction[:, None]
-        good = (normal > 0) & ((friction[..., None] * normal) ** 2 > sideways)
-        return good.all(-1) & (friction > 0)
-
-    def nearer(self, at: LeastBalance) -> LeastBalance:
-        """Return the balance after a whole step to the last nu, or the same one if the step would
-        leave a cone, as on a kink.
-        """
-        still, centring = self.directions(at)
-        whole = torch.ones_like(at.friction)
-        change = still.plus(centring, CRITICAL.exact * whole)
-        stays = self.inside(at, change, whole[:, None])[:, 0] & (self.longest(at, change) > 1)
-        return at.plus(change, stays.to(whole))
 
     def refined(self, at: LeastBalance) -> LeastBalance:
         """Return the balance after a whole step to the last nu, without elimination of unknowns.
 
-        It is slower than `nearer`. But the matrix stays regular for small nu, so that derivatives
+        It is slower than `_Cones.nearer`. But the matrix stays regular for small nu, so that derivatives
         of the step are exact.
         """
         f = self.normals.shape[1]
@@ -419,8 +574,8 @@ class _Cones(NamedTuple):
         """
         n = self.normals[..., None]  # (b, f, 3, 1)
         mu = at.friction[:, None, None, None]
-        push, tangential = (x[..., None] for x in self.split(at.forces))
-        push = push[..., None]  # (b, f, 1, 1)
+        push = -dot(at.forces, self.normals)[..., None, None]
+        tangential = at.forces[..., None] + push * n
         press = at.press[..., None, None]
         slide = at.slide[..., None]
         x = mu * push
@@ -453,137 +608,36 @@ class _Cones(NamedTuple):
         ]
         return torch.cat(matrix, 1), torch.cat(residual, 1)
 
-    def directions(
-        self, at: LeastBalance, held: Bool[Tensor, "b"] | None = None
-    ) -> tuple[LeastBalance, LeastBalance]:
-        """Return Newton's step to nu = 0, and its change for each unit of nu.
 
-        The friction does not change where `held`. Forces and cone multipliers are eliminated: the
-        eight unknowns left are the twist, the scale and the friction.
-        """
-        push, tangential = self.split(at.forces)
-        x = at.friction[:, None] * push
-        scaling = _Scaling.of(x, tangential, at.press, at.slide)
-        softness = scaling.softness(self.normals, at.friction)
-        stiff = (2 * scaling.ahead**2 - 1) / scaling.beta
-        by_friction = self._by_friction(at, push, stiff, scaling)
-        rows = torch.cat([self.rows, by_friction[:, None]], 1)  # (b, 8, f, 3)
-        softened = _soften(rows, softness)
-        matrix = softened.flatten(2) @ rows.flatten(2).mT
-        corner = eye_like(8, self.normals)[7]
-        last = (push**2 * stiff).sum(1)
-        matrix = matrix - last[:, None, None] * (corner[:, None] * corner)
-        # what the forces would do if the eight unknowns did not change: for both directions
-        inverse_x = 1 / _form(x, tangential)
-        still = _soften(self._lacking(at)[:, None], softness)[:, 0] - at.forces
-        free = torch.stack([still, self._centring(at)], 1)  # (b, 2, f, 3)
-        right = free.flatten(2) @ rows.flatten(2).mT  # (b, 2, 8)
-        right = right + self._residuals(at, (push * x * inverse_x).sum(1))
-        if held is not None:
-            matrix[held, 7] = corner
-            right[held, :, 7] = 0
-        solved, _ = torch.linalg.solve_ex(matrix, right.mT)
-        solved = solved.mT  # (b, 2, 8)
-        forces = free - (solved @ softened.flatten(2)).unflatten(2, self.normals.shape[1:])
-        twist, scale, friction = solved.split([6, 1, 1], 2)
-        # the change of the multipliers follows from that of x: D and the scaling point give it
-        n = self.normals[:, None]
-        more = -_dot(forces, n)
-        sideways = forces + more[..., None] * n
-        more = at.friction[:, None, None] * more + push[:, None] * friction
-        press = torch.stack([-at.press, x * inverse_x], 1)
-        slide = torch.stack([-at.slide, -tangential * inverse_x[..., None]], 1)
-        ahead, across = scaling.stiffened(more, sideways)
-        press = press - ahead
-        slide = slide + across
-        parts = (forces, friction[..., 0], press, slide, twist, scale[..., 0])
-        first, second = (LeastBalance(*(x[:, i] for x in parts)) for i in range(2))
-        return first, second
-
-    def _by_friction(
-        self,
-        at: LeastBalance,
-        push: Float[Tensor, "b f"],
-        stiff: Float[Tensor, "b f"],
-        scaling: "_Scaling",
-    ) -> Vectors:
-        """Return how the equations of the multipliers, by contact, change with the friction."""
-        ahead = (at.press - at.friction[:, None] * push * stiff)[..., None] * self.normals
-        return ahead - (2 * push * scaling.ahead / scaling.beta)[..., None] * scaling.across
-
-    def _lacking(self, at: LeastBalance) -> Vectors:
-        """Return what M_i^T s_i lacks to G_i^T y + l n_i."""
-        multipliers = torch.cat([at.twist, at.scale[:, None]], 1)
-        pull = at.slide - (at.friction[:, None] * at.press)[..., None] * self.normals
-        return pull - torch.einsum("br,brfi->bfi", multipliers, self.rows)
-
-    def _centring(self, at: LeastBalance) -> Vectors:
-        """Return the change of the forces for each unit of nu: that of the inverses of s_i."""
-        inverse_s = 1 / _form(at.press, at.slide)
-        pull = (at.press / at.friction[:, None])[..., None] * self.normals
-        return -inverse_s[..., None] * (at.slide + pull)
-
-    def _residuals(self, at: LeastBalance, weighed: Float[Tensor, "b"]) -> Float[Tensor, "b 2 8"]:
-        """Return the residuals of balance, sum and sum a_i s_i0, for both directions.
-
-        `weighed` is the change of the last one for each unit of nu.
-        """
-        total = torch.einsum("brfi,bfi->br", self.rows, at.forces)
-        pressed = torch.full_like(self.load[:, :1], self.normals.shape[1])
-        total = total + torch.cat([self.load, pressed], 1)
-        residual = torch.cat([total, torch.ones_like(weighed)[:, None]], 1)
-        other = -weighed[:, None] * eye_like(8, total)[7]
-        return torch.stack([residual, other], 1)
+def _sum(x: Float[Tensor, "*a b"], axis: int) -> Float[Tensor, "*c b"]:
+    """Return sums over a short axis, term by term: the order of a longer sum of torch depends on
+    the number of contact sets.
+    """
+    return functools.reduce(torch.add, x.unbind(axis))
 
 
-class _Scaling(NamedTuple):
-    """The scaling points w = (ahead, across) of x and s by contact, and their factors beta."""
-
-    ahead: Float[Tensor, "b f"]
-    across: Vectors
-    beta: Float[Tensor, "b f"]
-
-    @classmethod
-    def of(
-        cls,
-        x: Float[Tensor, "b f"],
-        tangential: Vectors,
-        press: Float[Tensor, "b f"],
-        slide: Vectors,
-    ) -> "_Scaling":
-        """Return the scaling points of (x, tangential) and (press, slide)."""
-        size_x = _form(x, tangential).sqrt()
-        size_s = _form(press, slide).sqrt()
-        both = x / size_x * (press / size_s)
-        both = both + _dot(tangential, slide) / (size_x * size_s)
-        half = 2 * ((1 + both) / 2).sqrt()
-        ahead = (x / size_x + press / size_s) / half
-        across = (tangential / size_x[..., None] - slide / size_s[..., None]) / half[..., None]
-        return cls(ahead, across, size_x / size_s)
-
-    def softness(self, normals: Vectors, friction: Float[Tensor, "b"]) -> Float[Tensor, "b f 3 3"]:
-        """Return D^-1 in the space of forces: beta (2 w w^T + 1 - (1 + 1/mu^2) n n^T)."""
-        mu = friction[:, None]
-        point = self.across - (self.ahead / mu)[..., None] * normals
-        steep = (1 + 1 / mu**2)[..., None] * normals
-        softness = 2 * _outer(point, point) + eye_like(3, normals) - _outer(steep, normals)
-        return self.beta[..., None, None] * softness
-
-    def stiffened(
-        self, ahead: Float[Tensor, "b c f"], across: Float[Tensor, "b c f 3"]
-    ) -> tuple[Float[Tensor, "b c f"], Float[Tensor, "b c f 3"]]:
-        """Return the two parts of D applied to c vectors for each contact, the second one negated."""
-        inner = self.ahead[:, None] * ahead - _dot(self.across[:, None], across)
-        ahead = (2 * self.ahead[:, None] * inner - ahead) / self.beta[:, None]
-        across = 2 * inner[..., None] * self.across[:, None] - across
-        return ahead, across / self.beta[:, None, :, None]
+def _by_row(products: Float[Tensor, "*r 3 f b"]) -> Float[Tensor, "*r b"]:
+    """Return sums over contacts and their axes."""
+    return _sum(products.sum(-3), -2)
 
 
-def _soften(
-    z: Float[Tensor, "b c f 3"], softness: Float[Tensor, "b f 3 3"]
-) -> Float[Tensor, "b c f 3"]:
-    """Return the products of vectors by contact with the contact's softness."""
-    return (z.transpose(1, 2) @ softness).transpose(1, 2)
+def _products(
+    first: Float[Tensor, "m 3 f b"], second: Float[Tensor, "k 3 f b"]
+) -> Float[Tensor, "m k b"]:
+    """Return the product of each row of the one with each row of the other."""
+    terms = zip(first.flatten(1, 2).unbind(1), second.flatten(1, 2).unbind(1), strict=True)
+    total = first.new_zeros(len(first), len(second), first.shape[-1])
+    for x, y in terms:
+        total.addcmul_(x[:, None], y)
+    return total
+
+
+def _solved(
+    matrix: Float[Tensor, "m m b"], right: Float[Tensor, "m k b"]
+) -> Float[Tensor, "m k b"]:
+    """Return the solutions of the linear equations of b contact sets, for k right sides."""
+    solved, _ = torch.linalg.solve_ex(matrix.permute(2, 0, 1), right.permute(2, 0, 1))
+    return solved.permute(1, 2, 0).contiguous()
 
 
 def _by_contact(*blocks: Float[Tensor, "b f r _"]) -> Float[Tensor, "b m q"]:
@@ -606,37 +660,3 @@ def _summed(*blocks: Float[Tensor, "b f 1 _"]) -> Float[Tensor, "b 1 q"]:
     """Return the row of an equation that sums over contacts."""
     *own, common = blocks
     return torch.cat([*(x.flatten(1)[:, None] for x in own), common.sum(1)], 2)
-
-
-def _dot(a: Float[Tensor, "*b 3"], b: Float[Tensor, "*c 3"]) -> Float[Tensor, "*e"]:
-    """Return the dot products of vectors; three terms are faster than a sum over a short axis."""
-    x, y, z = (a * b).unbind(-1)
-    return x + y + z
-
-
-def _outer(a: Float[Tensor, "*b 3"], b: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return the outer products of vectors."""
-    return a[..., None] * b[..., None, :]
-
-
-def _form(ahead: Float[Tensor, "*b"], across: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return ahead^2 - |across|^2, which is positive inside the cone."""
-    return ahead**2 - _dot(across, across)
-
-
-def _way(
-    ahead: Float[Tensor, "*b"],
-    across: Float[Tensor, "*b 3"],
-    more: Float[Tensor, "*b"],
-    sideways: Float[Tensor, "*b 3"],
-) -> Float[Tensor, "*b"]:
-    """Return the way from a point in the cone along a direction to the cone's edge; infinite if it
-    never ends.
-    """
-    a = _form(more, sideways)
-    b = ahead * more - _dot(across, sideways)
-    c = _form(ahead, across)
-    root = (b**2 - a * c).clamp_min(0).sqrt()
-    q = -(b + torch.where(b >= 0, root, -root))
-    ends = torch.stack([q / a, c / q], -1)
-    return torch.where(ends > 0, ends, torch.inf).amin(-1)
