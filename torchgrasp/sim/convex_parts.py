@@ -25,7 +25,7 @@ from torchgrasp.sim.decompose import decompose
 
 
 @dataclasses.dataclass(frozen=True)
-class PartNumbers:
+class CutNumbers:
     """Parameters of the cut of a mesh into convex parts."""
 
     thresholds: tuple[float, ...] = (0.05, 0.02, 0.01)
@@ -42,7 +42,7 @@ class PartNumbers:
     """Points of this surface that are measured."""
 
 
-PARTS = PartNumbers()
+CUT = CutNumbers()
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """Settings of CoACD's search for cuts, which make it narrower and faster than by default."""
 MOST_PARTS = 1000  # most parts that a caller may give
@@ -59,7 +59,7 @@ def convex_parts(
     part.
 
     Parts of which more than 5 % of the surface lies farther than 1 mm outside the mesh
-    (`PARTS.bulge`) are cut again, finer, at most twice.
+    (`CUT.bulge`) are cut again, finer, at most twice.
 
     Args:
         mesh: the closed mesh [m], or its file.
@@ -116,18 +116,18 @@ def _cut(mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
     if mesh.is_convex:
         return [hull(mesh.vertices)]
     parts = list[trimesh.Trimesh]()
-    for threshold in PARTS.thresholds:
+    for threshold in CUT.thresholds:
         try:
             pieces = decompose(mesh, {"threshold": threshold, **_SEARCH})
         except MeshError as error:
             if not parts:
                 raise
             _log.warning(
-                "parts bulge by more than %g m, and were not cut finer: %s", PARTS.bulge, error
+                "parts bulge by more than %g m, and were not cut finer: %s", CUT.bulge, error
             )
             break
         parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in pieces]
-        if bulge_of(parts, mesh) <= PARTS.bulge:
+        if bulge_of(parts, mesh) <= CUT.bulge:
             break
     return parts
 
@@ -135,13 +135,13 @@ def _cut(mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
 def bulge_of(parts: "Sequence[trimesh.Trimesh]", mesh: "trimesh.Trimesh") -> float:
     """Return the distance [m] outside a closed mesh within which most of its parts' surface lies.
 
-    It is a quantile (`PARTS.within`) over points drawn evenly from the surfaces of the parts.
+    It is a quantile (`CUT.within`) over points drawn evenly from the surfaces of the parts.
     """
     from trimesh.proximity import closest_point
     from trimesh.sample import sample_surface
 
     shares = np.array([part.area for part in parts])
-    counts = np.ceil(PARTS.sampled * shares / shares.sum()).astype(int)
+    counts = np.ceil(CUT.sampled * shares / shares.sum()).astype(int)
     drawn = [
         sample_surface(part, count, seed=0)[0] for part, count in zip(parts, counts, strict=True)
     ]
@@ -150,7 +150,7 @@ def bulge_of(parts: "Sequence[trimesh.Trimesh]", mesh: "trimesh.Trimesh") -> flo
     height = np.zeros(len(points))
     if outside.any():
         height[outside] = closest_point(mesh, points[outside])[1]
-    return float(np.quantile(height, PARTS.within))
+    return float(np.quantile(height, CUT.within))
 
 
 def read_solid(
@@ -206,7 +206,7 @@ def _fingerprint(mesh: "trimesh.Trimesh") -> str:
     """Return the cache's key for a mesh: a SHA-256 of the mesh and of the settings with which it is
     cut.
     """
-    digest = hashlib.sha256(f"coacd {PARTS} {sorted(_SEARCH.items())}".encode())
+    digest = hashlib.sha256(f"coacd {dataclasses.astuple(CUT)} {sorted(_SEARCH.items())}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
     return digest.hexdigest()
