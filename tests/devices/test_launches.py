@@ -42,7 +42,7 @@ KNOWN = {
     "contacts/problem.py": "of",
     "contacts/plan.py": "plan_chunk",
     "contacts/starts.py": "candidate_rows qualify settle_flatness",
-    "planner/rows.py": "_drop_weak _share_carried _spread _table by_cloud choose find find_candidates select with_costs",
+    "planner/rows.py": "_drop_weak _carried _spread _table by_cloud choose find find_candidates select with_costs",
     "planner/report.py": "_tell end_batch",
     "planner/planner.py": "plan_objects solve_fixed step try_first try_fully without",
     "planner/run.py": "finish relax",

@@ -26,11 +26,11 @@ from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.attempts import assign
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
 from torchgrasp.planner.objects import join_objects, pose_request
-from torchgrasp.planner.ranking import UNCARRIED, predict
+from torchgrasp.planner.ranking import predict
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.rows import draw, find_candidates, with_costs
 from torchgrasp.success import TaskWrenches
-from torchgrasp.success.features import measure_grasps
+from torchgrasp.success.features import UNCARRIED, measure_grasps
 from torchgrasp.success.loads import strength_of
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.task import Conditions, loads_of

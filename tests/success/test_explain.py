@@ -143,3 +143,14 @@ def test_no_grasps_and_grasps_of_unknown_friction_are_refused():
     )
     with pytest.raises(BadArgument, match="grasps"):
         explain_success(bare, hand, shape)
+
+
+def test_a_weight_that_no_forces_carry_is_told_and_lowers_the_success_by_the_load():
+    grasp, hand, shape = jug()
+    told = {}
+    for mass in (0.1, 10.0):
+        costs = explain_success(grasp, hand, shape, GraspTask(mass=mass))
+        told[mass] = {cost.cause: cost.sentence for cost in costs}
+    # the drives of the hand cannot lift ten kilograms at any friction
+    assert "no forces of the fingers carry the weight" in told[10.0]["load"]
+    assert all("carry the weight" not in sentence for sentence in told[0.1].values())

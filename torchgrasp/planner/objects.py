@@ -53,7 +53,7 @@ from torchgrasp.shape.fit import FitOptions, fit_upright
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import Mesh, collision_field, extract_mesh
 from torchgrasp.success.body import EstimatedBody
-from torchgrasp.success.features import GRIP, MEASURES
+from torchgrasp.success.features import GRIP, weight_about
 from torchgrasp.success.promise import describe_promise
 from torchgrasp.success.task import loads_of
 from torchgrasp.values.distribution import Distribution
@@ -213,10 +213,7 @@ class Objects:
         if not task.lifts(self.spec.plane):
             return None
         center = self.body.rows(cloud).center.to(contacts.points)
-        arm = center - contacts.points.mean(1)
-        force = torch.zeros_like(arm)
-        force[:, 2] = -MEASURES.gravity * Distribution.of(task.mass).mean
-        return torch.cat([force, torch.linalg.cross(arm, force)], -1)
+        return weight_about(contacts.points, center, Distribution.of(task.mass).mean)
 
     @property
     def library(self) -> PostureLibrary:

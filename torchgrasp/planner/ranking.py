@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.contacts.resist import resist_loads, share_carried
+from torchgrasp.contacts.resist import resist_loads
 from torchgrasp.foundation.base import join
 from torchgrasp.foundation.errors import Status
 from torchgrasp.ik.motion import collision_probability
 from torchgrasp.planner.objects import CloudIndex, Objects
-from torchgrasp.success.features import measure_grasps
+from torchgrasp.success.features import UNCARRIED, carries_weight, measure_grasps
 from torchgrasp.success.loads import strength_of
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.order import (
@@ -24,13 +24,10 @@ from torchgrasp.success.order import (
     rank_by_variance,
 )
 from torchgrasp.success.task import Conditions
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import Ranking
 
-UNCARRIED = 2.1
-"""Decrease of a lift's log-odds of success if not even the greatest finger forces carry the weight:
-of a logistic regression on the model's log-odds and this, in trials of authored bodies.
-"""
 SURE = 1e-6
 """Probability that stands for 0 in log-odds, so that they stay finite."""
 BEST = 20
@@ -92,11 +89,11 @@ def predict(
     )
     model = load_success_model(features.device)
     log_odds = model.mean_log_odds(features, conditions.weights)
-    weight = objects.weight_on(grasps.contacts, cloud)
-    if weight is not None:
-        strength = strength_of(objects.hand, grasps, grasps.contacts, objects.strongest)
-        carried = share_carried(grasps.contacts, strength, weight, objects.slipping)
-        log_odds = log_odds - UNCARRIED * (carried < 1)
+    if task.lifts(spec.plane):
+        center = objects.body.rows(cloud).center
+        mass = Distribution.of(task.mass).mean
+        carried = carries_weight(objects.hand, grasps, center, mass, spec, objects.strongest)
+        log_odds = log_odds - UNCARRIED * ~carried
     obstacles = objects.world.obstacles
     if obstacles is not None:
         hit = collision_probability(objects.hand, grasps, obstacles, spec.plane)

@@ -354,7 +354,7 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     lifted = objects.request.grasp_task.lifts(objects.spec.plane)
     if lifted or objects.loads is not None:
         spec = objects.slipping if objects.loads is None else objects.spec
-        share = _share_carried(objects, found, spec)
+        share = _carried(objects, found, spec)
         weak = weak.scatter_reduce(0, seeds.row, share, "amax")
         weak = torch.where(weak < 1, CHOICE.weak * (2 - weak), 0.0)
         seeds = seeds[lexical_order(seeds.row, -share)]
@@ -369,7 +369,7 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     return dataclasses.replace(found, seeds=seeds, cost=cost)
 
 
-def _share_carried(objects: Objects, found: Candidates, spec: ContactSpec) -> Float[Tensor, "g"]:
+def _carried(objects: Objects, found: Candidates, spec: ContactSpec) -> Float[Tensor, "g"]:
     """Return which share of its set's load, at most 1, the fingers of each initial posture can
     carry.
 

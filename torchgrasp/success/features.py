@@ -6,20 +6,22 @@ import dataclasses
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.contacts.balance import least_friction_forces
+from torchgrasp.contacts.resist import share_carried
 from torchgrasp.foundation.base import spread
 from torchgrasp.geometry.linalg import across, norm, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.body import EstimatedBody
-from torchgrasp.success.loads import carrying_force, greatest_force
+from torchgrasp.success.loads import carrying_force, greatest_force, strength_of
 from torchgrasp.success.moved import touch_moved
 from torchgrasp.success.task import Conditions, GraspTask
 from torchgrasp.values.planning import Contacts, Grasps
+from torchgrasp.values.specs import ContactSpec
 
 CAUSES: dict[str, dict[str, str]] = {
     "load": {"force needed": "N", "force to spare": "1", "offset": "m"},
@@ -75,6 +77,10 @@ class FeatureNumbers:
 
 
 MEASURES = FeatureNumbers()
+UNCARRIED = 2.1
+"""Decrease of a lift's log-odds of success if not even the greatest finger forces carry the weight:
+of a logistic regression on the model's log-odds and this, in trials of authored bodies.
+"""
 
 
 def measure_grasps(
@@ -144,6 +150,48 @@ def measure_grasps(
         for x in found.values()
     ]
     return torch.stack(columns, -1).flatten(0, 1)
+
+
+def weight_about(
+    points: Float[Tensor, "g f 3"], center: Float[Tensor, "*g 3"], mass: float
+) -> Float[Tensor, "g 6"]:
+    """Return the weight of a mass [kg] as a force [N] and a torque [N m] about the centroid of each
+    contact set.
+
+    The contacts (g, f, 3) [m] and the centre of mass are in an upright frame.
+    """
+    arm = center - points.mean(1)
+    force = torch.zeros_like(arm)
+    force[:, 2] = -MEASURES.gravity * mass
+    return torch.cat([force, torch.linalg.cross(arm, force)], -1)
+
+
+def carries_weight(
+    hand: Hand,
+    grasps: Grasps,
+    center: Float[Tensor, "*g 3"],
+    mass: float,
+    spec: ContactSpec,
+    most: float,
+) -> Bool[Tensor, "g"]:
+    """Return whether the fingers of each of g grasps can carry a weight with all of the friction.
+
+    By linear programming: no contact force is outside its friction cone, of the mean friction of
+    `spec`, and none is greater than the drives allow. `UNCARRIED` says what it means for success.
+
+    Args:
+        hand: the hand of the grasps.
+        grasps: the grasps, in an upright frame.
+        center: centre of mass [m]: one for all grasps, or one for each.
+        mass: the lifted mass [kg].
+        spec: constraints of the contacts.
+        most: greatest normal force [N] of a finger in the task.
+    """
+    contacts = grasps.contacts
+    strength = strength_of(hand, grasps, contacts, most)
+    weight = weight_about(contacts.points, center.to(contacts.points), mass)
+    slipping = dataclasses.replace(spec, friction_margin=1.0)
+    return share_carried(contacts, strength, weight, slipping) >= 1
 
 
 def _force_for(

@@ -13,12 +13,19 @@ from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.body import EstimatedBody
-from torchgrasp.success.features import CAUSES, measure_grasps
+from torchgrasp.success.features import (
+    CAUSES,
+    GRIP,
+    UNCARRIED,
+    carries_weight,
+    measure_grasps,
+)
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.order import supported_share
 from torchgrasp.success.task import Conditions, GraspTask
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import ContactSpec
 
 SENTENCES = {
     "load": (
@@ -70,8 +77,9 @@ def explain_success(
     greatest first.
 
     Each cause stands for several features of the success model. Its `log_odds` is by how much the
-    log-odds rise if these features take their median over grasps that held. Causes that do not
-    lower the success are left out.
+    log-odds rise if these features take their median over grasps that held. Where no forces of the
+    fingers carry a lifted weight, "load" counts for more. Causes that do not lower the success are
+    left out.
 
     If no trial has tested some of the task's frictions and masses, "task" is always among the
     causes. Its sentence then says for what share of them the success is unknown.
@@ -98,6 +106,7 @@ def explain_success(
         )
     task = GraspTask() if task is None else task
     features = measure_again(grasps[0], hand, shape, task)
+    carried = _is_carried(grasps[0], hand, shape, task)
     conditions = conditions_of(grasps, task)
     weights = conditions.weights.to(features)
     supported = supported_share(conditions)
@@ -114,7 +123,11 @@ def explain_success(
         usual = features.clone()
         usual[..., first : first + len(names)] = model.usual[first : first + len(names)]
         gain = float(model.mean_log_odds(usual, weights) - known)
-        told.append(Cost(cause, gain, SENTENCES[cause].format_map(values)))
+        sentence = SENTENCES[cause].format_map(values)
+        if cause == "load" and not carried:
+            gain += UNCARRIED
+            sentence += "; no forces of the fingers carry the weight"
+        told.append(Cost(cause, gain, sentence))
         first += len(names)
     lower = [cost for cost in sorted(told, key=lambda cost: -cost.log_odds) if cost.log_odds > 0]
     if not 0 < supported < 1 - ROUNDING:
@@ -140,14 +153,30 @@ def measure_again(
     The metadata of the grasps name the table and the friction. The `shape` is in the frame of the
     grasps.
     """
-    frame = inverse(upright_frame(shape.cloud.points, shape.cloud.viewpoint, grasps.table))
-    upright = move(grasps, frame)
-    shape = shape.moved(frame)
-    hand = hand.to(grasps.joints.device, grasps.joints.dtype)
+    hand, body, upright = _upright(grasps, hand, shape)
     conditions = conditions_of(grasps, task)
-    return measure_grasps(
-        hand, EstimatedBody.of(shape), upright, conditions, task, task.lifts(grasps.table)
-    )
+    return measure_grasps(hand, body, upright, conditions, task, task.lifts(grasps.table))
+
+
+def _is_carried(grasp: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask) -> bool:
+    """Return whether the fingers of a grasp can carry the weight that the task lifts, if any."""
+    lifts = task.lifts(grasp.table)
+    if not lifts:
+        return True
+    hand, body, upright = _upright(grasp, hand, shape)
+    spec = ContactSpec(Distribution.parse(grasp.meta["friction"]))
+    mass = Distribution.of(task.mass).mean
+    most = task.pressing(lifts) or GRIP
+    return bool(carries_weight(hand, upright, body.center, mass, spec, most))
+
+
+def _upright(grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[Hand, EstimatedBody, Grasps]:
+    """Return the hand on the device of the grasps, and the object and the grasps in an upright
+    frame.
+    """
+    frame = inverse(upright_frame(shape.cloud.points, shape.cloud.viewpoint, grasps.table))
+    hand = hand.to(grasps.joints.device, grasps.joints.dtype)
+    return hand, EstimatedBody.of(shape.moved(frame)), move(grasps, frame)
 
 
 def _say(value: float, unit: str) -> str:
