@@ -19,7 +19,7 @@ from torchgrasp import (
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.model import load_success_model
-from torchgrasp.success.reasons import explain_success, measure_again
+from torchgrasp.success.reasons import explain_success, measure_again, stand_upright
 
 FRICTION = Distribution.parse("0.3:0.8@3|1.0")
 MASS = Distribution.between(0.1, 0.4)
@@ -57,7 +57,9 @@ def one_body(monkeypatch):
 def success_at(grasps, shape, friction, mass):
     """The success of grasps if friction and mass were known."""
     known = dataclasses.replace(grasps, meta=grasps.meta | {"friction": str(friction)})
-    [features] = measure_again(known, load_hand("barrett"), shape, GraspTask(mass=mass))
+    [features] = measure_again(
+        *stand_upright(known, load_hand("barrett"), shape), GraspTask(mass=mass)
+    )
     return torch.sigmoid(load_success_model().log_odds(features))
 
 

@@ -31,7 +31,7 @@ from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, encode_fingertips, 
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.order import by_success, grade
 from torchgrasp.success.promise import Promise
-from torchgrasp.success.reasons import measure_again
+from torchgrasp.success.reasons import measure_again, stand_upright
 
 SPEC = ContactSpec(table=0.0)
 VIEW = load_object("cylinder").view
@@ -85,7 +85,9 @@ def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
 def test_success_is_what_the_model_says_of_the_features_that_an_explanation_measures_again(run):
     hand, grasps, stages = run
     best = grasps[grasps.status == Status.OK][:5]
-    odds = load_success_model().log_odds(measure_again(best, hand, stages["shape"], GraspTask())[0])
+    odds = load_success_model().log_odds(
+        measure_again(*stand_upright(best, hand, stages["shape"]), GraspTask())[0]
+    )
     torch.testing.assert_close(best.success, torch.sigmoid(odds), rtol=1e-6, atol=1e-6)
     near(best.interval, load_success_model().interval(odds), 1e-6)
 
@@ -97,7 +99,9 @@ def test_a_task_changes_the_predictions_and_not_the_grasps(task):
     note = lambda stage, text, value: shapes.append(value) if stage == "shape" else None  # noqa: E731
     grasps = plan_grasps(VIEW, hand, SPEC, starts=12, task=task, observer=note)
     best = grasps[grasps.status == Status.OK]
-    odds = load_success_model().log_odds(measure_again(best, hand, shapes[0], task)[0])
+    odds = load_success_model().log_odds(
+        measure_again(*stand_upright(best, hand, shapes[0]), task)[0]
+    )
     near(best.score, odds, 1e-6)
     assert grasps.meta["task"] == task.describe() != usual().meta["task"]
     first, second = (

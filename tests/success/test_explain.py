@@ -19,7 +19,7 @@ from torchgrasp.geometry.plane import move
 from torchgrasp.success import reasons as explain
 from torchgrasp.success.features import CAUSES, FEATURES
 from torchgrasp.success.model import load_success_model
-from torchgrasp.success.reasons import SENTENCES, measure_again
+from torchgrasp.success.reasons import SENTENCES, measure_again, stand_upright
 
 UNITS = {name: unit for names in CAUSES.values() for name, unit in names.items()}
 SHOWN = {
@@ -45,7 +45,7 @@ def jug():
 @functools.cache
 def features():
     """The features of the jug's grasp."""
-    return measure_again(*jug(), TASK)[0]
+    return measure_again(*stand_upright(*jug()), TASK)[0]
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_a_cause_that_does_not_lower_the_success_is_not_told(use):
 def test_a_heavier_object_makes_the_load_or_the_task_a_cause(use):
     for name, cause in (("mass", "task"), ("force needed", "load")):
         light, heavy = (
-            measure_again(*jug(), GraspTask(mass=mass))[0, 0, FEATURES.index(name)]
+            measure_again(*stand_upright(*jug()), GraspTask(mass=mass))[0, 0, FEATURES.index(name)]
             for mass in (0.05, 2.0)
         )
         assert light < heavy
@@ -118,7 +118,7 @@ def test_the_frame_of_object_and_grasp_does_not_matter(motion):
     there = dataclasses.replace(
         move(grasp, motion), meta=grasp.meta | {"table": grasp.table.moved(motion).describe()}
     )
-    [found] = measure_again(there, hand, shape.moved(motion), TASK)
+    [found] = measure_again(*stand_upright(there, hand, shape.moved(motion)), TASK)
     torch.testing.assert_close(found, features(), rtol=0.05, atol=1e-3)
 
 
@@ -130,7 +130,7 @@ def test_grasps_and_hand_may_have_different_dtypes():
     grasp, hand, shape = jug()
     for parts in ((grasp, hand.to(torch.float32)), (grasp.to(torch.float32), hand)):
         torch.testing.assert_close(
-            measure_again(*parts, shape, TASK)[0], features(), rtol=1e-2, atol=1e-3
+            measure_again(*stand_upright(*parts, shape), TASK)[0], features(), rtol=1e-2, atol=1e-3
         )
 
 

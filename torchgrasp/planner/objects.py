@@ -200,20 +200,22 @@ class Objects:
     @property
     def strongest(self) -> float:
         """The greatest normal force [N] of a finger in the task."""
-        task = self.request.grasp_task
-        return task.pressing(task.lifts(self.spec.plane)) or GRIP
+        return self.request.grasp_task.pressing(self.lifts) or GRIP
 
-    def weight_on(self, contacts: Contacts, cloud: CloudIndex) -> Float[Tensor, "b 6"] | None:
-        """Return the mean weight of each contact set's object, or None if the task is not a lift.
+    @property
+    def lifts(self) -> bool:
+        """Whether the task lifts the objects."""
+        return self.request.grasp_task.lifts(self.spec.plane)
+
+    def weight_on(self, contacts: Contacts, cloud: CloudIndex) -> Float[Tensor, "b 6"]:
+        """Return the mean weight of each contact set's object.
 
         It is a force [N] and a torque [N m] about the contacts' centroid. `cloud` is the index of
         each contact set's object.
         """
-        task = self.request.grasp_task
-        if not task.lifts(self.spec.plane):
-            return None
         center = self.body.rows(cloud).center.to(contacts.points)
-        return weight_about(contacts.points, center, Distribution.of(task.mass).mean)
+        mass = Distribution.of(self.request.grasp_task.mass).mean
+        return weight_about(contacts.points, center, mass)
 
     @property
     def library(self) -> PostureLibrary:

@@ -92,7 +92,9 @@ def predict(
     if task.lifts(spec.plane):
         center = objects.body.rows(cloud).center
         mass = Distribution.of(task.mass).mean
-        carried = carries_weight(objects.hand, grasps, center, mass, spec, objects.strongest)
+        carried = carries_weight(
+            objects.hand, grasps, center, mass, objects.slipping, objects.strongest
+        )
         log_odds = log_odds - UNCARRIED * ~carried
     obstacles = objects.world.obstacles
     if obstacles is not None:

@@ -255,11 +255,10 @@ def find_candidates(
     """
     request = objects.request
     load = plan.contacts.points.new_zeros(len(plan), 6)
-    weight = objects.weight_on(plan.contacts, cloud)
     if objects.loads is not None:
         plan, load = _drop_weak(objects, plan, cloud, load)
-    elif weight is not None:
-        load = weight
+    elif objects.lifts:
+        load = objects.weight_on(plan.contacts, cloud)
     note("plan", plan)
     if request.mode == "paper" and request.order == "variance":
         variance = plan.contacts.variance
@@ -351,8 +350,7 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     contacts = found.contacts
     seeds = found.seeds
     weak = torch.zeros_like(found.certificate.margin)
-    lifted = objects.request.grasp_task.lifts(objects.spec.plane)
-    if lifted or objects.loads is not None:
+    if objects.lifts or objects.loads is not None:
         spec = objects.slipping if objects.loads is None else objects.spec
         share = _carried(objects, found, spec)
         weak = weak.scatter_reduce(0, seeds.row, share, "amax")

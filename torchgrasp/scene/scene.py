@@ -391,11 +391,17 @@ class Scene(Value):
 
         Empty without a target. Empty for a target that is `given`, too: its outline is no guess.
         """
-        return self._on_target(self._guesses())
+        # the search for guesses goes over the whole image
+        return () if self._is_sure else self._on_target(self._guesses())
+
+    @property
+    def _is_sure(self) -> bool:
+        """Whether there is no target, or one whose outline is `given`."""
+        return self.target is None or self.target in self.given
 
     def _on_target(self, guesses: list[Guess]) -> tuple[str, ...]:
         """Return the sentences of those guesses that are on a target which is not `given`."""
-        if self.target is None or self.target in self.given:
+        if self._is_sure:
             return ()
         return tuple(sentence for labels, sentence in guesses if self.target in labels)
 

@@ -127,12 +127,12 @@ def _cut(mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
             )
             break
         parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in pieces]
-        if bulge_of(parts, mesh) <= CUT.bulge:
+        if _bulge(parts, mesh) <= CUT.bulge:
             break
     return parts
 
 
-def bulge_of(parts: "Sequence[trimesh.Trimesh]", mesh: "trimesh.Trimesh") -> float:
+def _bulge(parts: "Sequence[trimesh.Trimesh]", mesh: "trimesh.Trimesh") -> float:
     """Return the distance [m] outside a closed mesh within which most of its parts' surface lies.
 
     It is a quantile (`CUT.within`) over points drawn evenly from the surfaces of the parts.

@@ -174,24 +174,23 @@ def carries_weight(
     spec: ContactSpec,
     most: float,
 ) -> Bool[Tensor, "g"]:
-    """Return whether the fingers of each of g grasps can carry a weight with all of the friction.
+    """Return whether the fingers of each of g grasps can carry a weight.
 
-    By linear programming: no contact force is outside its friction cone, of the mean friction of
-    `spec`, and none is greater than the drives allow. `UNCARRIED` says what it means for success.
+    By linear programming: no contact force is outside its friction cone, and none is greater than
+    the drives allow. `UNCARRIED` says what it means for success.
 
     Args:
         hand: the hand of the grasps.
         grasps: the grasps, in an upright frame.
         center: centre of mass [m]: one for all grasps, or one for each.
         mass: the lifted mass [kg].
-        spec: constraints of the contacts.
+        spec: its `planned_friction` and `edges` define the friction cones.
         most: greatest normal force [N] of a finger in the task.
     """
     contacts = grasps.contacts
     strength = strength_of(hand, grasps, contacts, most)
     weight = weight_about(contacts.points, center.to(contacts.points), mass)
-    slipping = dataclasses.replace(spec, friction_margin=1.0)
-    return share_carried(contacts, strength, weight, slipping) >= 1
+    return share_carried(contacts, strength, weight, spec) >= 1
 
 
 def _force_for(

@@ -105,8 +105,9 @@ def explain_success(
             "grasps", f"{len(grasps)} grasps, planned for no friction", "grasps of plan_grasps"
         )
     task = GraspTask() if task is None else task
-    features = measure_again(grasps[0], hand, shape, task)
-    carried = _is_carried(grasps[0], hand, shape, task)
+    stood = stand_upright(grasps[0], hand, shape)
+    features = measure_again(*stood, task)
+    carried = _is_carried(*stood, task)
     conditions = conditions_of(grasps, task)
     weights = conditions.weights.to(features)
     supported = supported_share(conditions)
@@ -146,33 +147,35 @@ def conditions_of(grasps: Grasps, task: GraspTask) -> Conditions:
 
 
 def measure_again(
-    grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask
+    hand: Hand, body: EstimatedBody, grasps: Grasps, task: GraspTask
 ) -> Float[Tensor, "c g k"]:
     """Return the `FEATURES` of g planned grasps for any task, under its c conditions.
 
-    The metadata of the grasps name the table and the friction. The `shape` is in the frame of the
-    grasps.
+    The first three arguments are those that `stand_upright` returns. The metadata of the grasps
+    name the table and the friction.
     """
-    hand, body, upright = _upright(grasps, hand, shape)
     conditions = conditions_of(grasps, task)
-    return measure_grasps(hand, body, upright, conditions, task, task.lifts(grasps.table))
+    return measure_grasps(hand, body, grasps, conditions, task, task.lifts(grasps.table))
 
 
-def _is_carried(grasp: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask) -> bool:
-    """Return whether the fingers of a grasp can carry the weight that the task lifts, if any."""
+def _is_carried(hand: Hand, body: EstimatedBody, grasp: Grasps, task: GraspTask) -> bool:
+    """Return whether the fingers of an upright grasp can carry the weight that the task lifts, if
+    any.
+    """
     lifts = task.lifts(grasp.table)
     if not lifts:
         return True
-    hand, body, upright = _upright(grasp, hand, shape)
-    spec = ContactSpec(Distribution.parse(grasp.meta["friction"]))
+    spec = ContactSpec(Distribution.parse(grasp.meta["friction"]), friction_margin=1.0)
     mass = Distribution.of(task.mass).mean
     most = task.pressing(lifts) or GRIP
-    return bool(carries_weight(hand, upright, body.center, mass, spec, most))
+    return bool(carries_weight(hand, grasp, body.center, mass, spec, most))
 
 
-def _upright(grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[Hand, EstimatedBody, Grasps]:
+def stand_upright(grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[Hand, EstimatedBody, Grasps]:
     """Return the hand on the device of the grasps, and the object and the grasps in an upright
     frame.
+
+    The `shape` is in the frame of the grasps.
     """
     frame = inverse(upright_frame(shape.cloud.points, shape.cloud.viewpoint, grasps.table))
     hand = hand.to(grasps.joints.device, grasps.joints.dtype)
