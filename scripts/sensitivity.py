@@ -7,8 +7,9 @@ Numbers are the constants of modules, and the fields of options values: frozen d
 names end in Numbers or Layout, with their default instances.
 
 A number whose change alters no plan and no closing has no effect on these objects. It is removed,
-or its reason is a case that these objects do not have. The first case that differs ends the search,
-so the order of cases is that of cost.
+or its reason is a case that these objects do not have. The first case that differs ends the search
+for a number, so the order of cases is that of cost. Where few numbers have an effect, several are
+moved at once.
 """
 
 import argparse
@@ -22,7 +23,8 @@ import re
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -36,6 +38,21 @@ CLOSED = ("control", "sim", "evaluation")
 """Folders whose numbers act on plans, and on closings."""
 OPTIONS = ("Numbers", "Layout")
 """Ends of the names of options values."""
+FACTORS = (1.2, 0.8)
+"""Factors by which a number is moved."""
+TOGETHER = 8
+"""Most numbers that are moved at once, where few have an effect."""
+WAYS = (
+    "guarded, grip",
+    "uncertainty",
+    "impedance",
+    "paper",
+    "paper position",
+    "torque",
+    "binary",
+    "mujoco",
+)
+"""Ways to close a hand, of those of `golden.py`."""
 SENSITIVITY = """Each constant and each field of an options value is moved by 20 %, up and then down.
 It acts on plans, a scene and closings.
 A number without effect here is a tolerance, a bound of memory or of a file, or serves a case that is not here."""
@@ -48,6 +65,18 @@ class Number(NamedTuple):
     name: str
     line: int
     column: int
+
+    @property
+    def key(self) -> str:
+        """The number's place and name, as they stand in the JSON file."""
+        return f"{self.module}:{self.line} {self.name} [{self.column}]"
+
+
+class Case(NamedTuple):
+    """A case on which numbers are tried: its name, and a function that returns its hash."""
+
+    name: str
+    run: Callable[[], str]
 
 
 def is_number(node: ast.expr) -> bool:
@@ -79,25 +108,18 @@ def statements_of(tree: ast.Module) -> Iterator[tuple[str, ast.stmt]]:
 
 
 class Moved(importlib.machinery.SourceFileLoader):
-    """A loader that multiplies one number of a module."""
+    """A loader that multiplies some numbers of a module by a factor."""
 
-    number: Number
+    numbers: Sequence[Number]
     factor: float
 
     def source_to_code(self, data: Any, path: Any, **_: Any) -> Any:
-        """Compile the source with the number moved."""
+        """Compile the source with the numbers moved."""
         tree = ast.parse(data)
+        places = {(number.line, number.column) for number in self.numbers}
         for node in ast.walk(tree):
-            here = (
-                isinstance(node, ast.Constant) and (node.lineno, node.col_offset) == self.number[2:]
-            )
-            if here and isinstance(node, ast.Constant) and isinstance(node.value, int | float):
-                value = node.value * self.factor
-                node.value = (
-                    type(node.value)(value)
-                    if isinstance(node.value, float)
-                    else _whole(node.value, value)
-                )
+            if isinstance(node, ast.Constant) and (node.lineno, node.col_offset) in places:
+                node.value = moved(node.value, self.factor)
         return compile(tree, path, "exec")
 
     def get_code(self, fullname: str) -> Any:
@@ -105,57 +127,49 @@ class Moved(importlib.machinery.SourceFileLoader):
         return self.source_to_code(self.get_data(self.path), self.path)
 
 
-def _whole(old: int, new: float) -> int:
-    """Return a whole number near `new` that is not `old`."""
-    return round(new) if round(new) != old else old + (1 if new > old else -1)
+def moved(value: Any, factor: float) -> Any:
+    """Return a number times a factor; of a whole number, a whole number near it that is another."""
+    if isinstance(value, float):
+        return value * factor
+    near = round(value * factor)
+    return near if near != value else value + (1 if factor > 1 else -1)
 
 
 class Finder(importlib.abc.MetaPathFinder):
-    """Finds the module of the number that is moved."""
+    """Finds the modules of the numbers that are moved."""
 
-    def __init__(self, number: Number, factor: float) -> None:
-        self.number = number
+    def __init__(self, numbers: Sequence[Number], factor: float) -> None:
+        self.numbers = numbers
         self.factor = factor
 
     def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> Any:
-        """Return a spec with the loader that moves the number."""
-        if fullname != self.number.module:
+        """Return a spec with the loader that moves the module's numbers."""
+        numbers = [number for number in self.numbers if number.module == fullname]
+        if not numbers:
             return None
         spec = importlib.machinery.PathFinder.find_spec(fullname, path)
         assert spec is not None and spec.origin is not None
         loader = Moved(fullname, spec.origin)
-        loader.number = self.number
+        loader.numbers = numbers
         loader.factor = self.factor
         return importlib.util.spec_from_file_location(fullname, spec.origin, loader=loader)
 
 
-def cases(
-    number: Number | None, objects: Path | None, names: list[str]
-) -> Iterator[tuple[str, Callable[[], str]]]:
-    """Yield the cases on which a number is tried; None: all."""
+def cases_of(folder: str, objects: Path | None, names: list[str]) -> Iterator[Case]:
+    """Yield the cases on which the numbers of a folder are tried, the cheapest first."""
     import golden
 
-    folder = "" if number is None else number.module.split(".")[1]
-    if number is None or folder not in CLOSED:
+    if folder not in CLOSED:
         for view in (("jug", 1), ("spray", 3)):
-            yield f"plan {view}", lambda view=view: golden.plan(*view, "allegro", "joint")
-        yield "scene", plan_scene
+            yield Case(f"plan {view}", partial(golden.plan, *view, "allegro", "joint"))
         for name in names if objects is not None else []:
-            yield f"plan {name}", lambda name=name: plan_object(objects, name)
-        yield "contact first", lambda: golden.plan("cylinder", 2, "barrett", "contact_first")
-        yield "paper", lambda: golden.plan("jug", 0, "barrett", "paper")
-    if number is None or folder in (*CLOSED, "contacts", "geometry", "hand", "ik", "shape"):
-        for how in (
-            "guarded, grip",
-            "uncertainty",
-            "impedance",
-            "paper",
-            "paper position",
-            "torque",
-            "binary",
-            "mujoco",
-        ):
-            yield f"close {how}", lambda how=how: golden.close("jug", "allegro", how)
+            yield Case(f"plan {name}", partial(plan_object, objects, name))
+        yield Case("scene", plan_scene)
+        yield Case("contact first", partial(golden.plan, "cylinder", 2, "barrett", "contact_first"))
+        yield Case("paper", partial(golden.plan, "jug", 0, "barrett", "paper"))
+    if folder in (*CLOSED, "contacts", "geometry", "hand", "ik", "shape"):
+        for how in WAYS:
+            yield Case(f"close {how}", partial(golden.close, "jug", "allegro", how))
 
 
 def plan_scene() -> str:
@@ -181,38 +195,27 @@ def plan_object(objects: Any, name: str) -> str:
     )
 
 
-def compute(
-    number: Number | None,
-    factor: float,
-    objects: Path | None,
-    names: list[str],
-    before: dict[str, str],
-) -> Any:
-    """Return the first case that a moved number changes; without a number, the hash of every case."""
+def compute(numbers: Sequence[Number], factor: float, case: Case) -> str:
+    """Return the hash of a case with some numbers moved; of an error, its text."""
     import torch
 
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    if number is not None:
-        sys.meta_path.insert(0, Finder(number, factor))
-    found = {}
+    if numbers:
+        sys.meta_path.insert(0, Finder(numbers, factor))
     try:
-        for case, run in cases(number, objects, names):
-            found[case] = run()
-            if number is not None and found[case] != before[case]:
-                return case
+        return case.run()
     except Exception as error:
-        if number is None:
+        if not numbers:
             raise
         return f"{type(error).__name__}: {error}"[:200]
-    return None if number is not None else found
 
 
 def _work(job: Any, pipe: Any) -> None:
     pipe.send(compute(*job))
 
 
-def in_child(*job: Any) -> Any:
+def in_child(*job: Any) -> str:
     """Run `compute` in a fork, which has loaded the large packages but nothing of torchgrasp."""
     context = multiprocessing.get_context("fork")
     mine, its = context.Pipe()
@@ -227,8 +230,45 @@ def in_child(*job: Any) -> Any:
         process.join()
 
 
+def that_change(numbers: Sequence[Number], factor: float, case: Case, before: str) -> list[Number]:
+    """Return the numbers whose move by a factor changes the hash `before` of a case.
+
+    Groups that change nothing grow to `TOGETHER`; a group that changes the hash is tried again in
+    smaller ones.
+    """
+    found = list[Number]()
+    left = list(numbers)
+    size = 1
+    while left:
+        group = left[:size]
+        left = left[size:]
+        if in_child(group, factor, case) == before:
+            size = min(2 * size, TOGETHER)
+        elif len(group) == 1:
+            found += group
+        else:
+            left = group + left
+            size //= 2
+    return found
+
+
+def try_folder(folder: str, objects: Path | None, names: list[str]) -> dict[str, str]:
+    """Return for each number of a folder the first case that it changes, or "no effect"."""
+    paths = sorted((ROOT / "torchgrasp" / folder).rglob("*.py"))
+    numbers = [number for path in paths for number in numbers_of(path)]
+    found = {}
+    for case in cases_of(folder, objects, names):
+        before = in_child([], 1.0, case)
+        for factor in FACTORS:
+            left = [number for number in numbers if number not in found]
+            for number in that_change(left, factor, case, before):
+                found[number] = case.name
+                print(f"{case.name:28} {number.key}", flush=True)
+    return {number.key: found.get(number, "no effect") for number in numbers}
+
+
 def main() -> int:
-    """Move each number up, and down where that changes nothing; write what changed."""
+    """Move the numbers of each folder up and down; write what changed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument(
         "--objects", type=Path, help="folder of objects with views, in which further plans are made"
@@ -243,7 +283,7 @@ def main() -> int:
         "--out",
         type=Path,
         required=True,
-        help="JSON file; numbers that it holds are not tried again",
+        help="JSON file; folders that it holds are not tried again",
     )
     parser.add_argument(
         "--publish", action="store_true", help="write docs/results/sensitivity.md, too"
@@ -258,20 +298,10 @@ def main() -> int:
     import torch  # noqa: F401
     import trimesh  # noqa: F401
 
-    before = in_child(None, 1.0, given.objects, given.names, {})
     done = json.loads(given.out.read_text()) if given.out.is_file() else {}
-    paths = [
-        path
-        for folder in given.folders
-        for path in sorted((ROOT / "torchgrasp" / folder).rglob("*.py"))
-    ]
-    for number in [number for path in paths for number in numbers_of(path)]:
-        key = f"{number.module}:{number.line} {number.name} [{number.column}]"
-        if key not in done:
-            up = in_child(number, 1.2, given.objects, given.names, before)
-            down = None if up else in_child(number, 0.8, given.objects, given.names, before)
-            done[key] = up or down or "no effect"
-            print(f"{done[key]:28} {key}", flush=True)
+    for folder in given.folders:
+        if not any(key.split(".")[1] == folder for key in done):
+            done |= try_folder(folder, given.objects, given.names)
             given.out.write_text(json.dumps(done, indent=1))
     print(
         f"{sum(value == 'no effect' for value in done.values())} of {len(done)} numbers have no effect"

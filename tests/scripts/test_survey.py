@@ -2,6 +2,7 @@
 
 import doctest
 
+import pytest
 import sensitivity
 import survey
 
@@ -72,8 +73,23 @@ def test_constants_and_fields_of_options_values_are_moved(tmp_path, monkeypatch)
     assert reasons == ["how far [m]", "tries before the hand gives up"]
     for name, moved in (("ClosingNumbers.lead", 0.3), ("ClosingNumbers.tries", 14)):
         loader = sensitivity.Moved("closing", str(path))
-        loader.number = found[name]
+        loader.numbers = [found[name]]
         loader.factor = 1.2
         content: dict = {"__name__": "closing"}
         exec(loader.get_code("closing"), content)
         assert abs(getattr(content["ClosingNumbers"](), name.split(".")[1]) - moved) < 1e-12
+
+
+@pytest.mark.parametrize("acting", [(), (3,), (0, 1, 2, 19), tuple(range(20))])
+def test_groups_of_moved_numbers_find_each_that_acts(monkeypatch, acting):
+    numbers = [sensitivity.Number("m", f"x{k}", k, 0) for k in range(20)]
+    sizes = []
+
+    def in_child(group, factor, case):
+        sizes.append(len(group))
+        return "other" if any(number.line in acting for number in group) else "before"
+
+    monkeypatch.setattr(sensitivity, "in_child", in_child)
+    found = sensitivity.that_change(numbers, 1.2, sensitivity.Case("", str), "before")
+    assert [number.line for number in found] == list(acting)
+    assert max(sizes) <= sensitivity.TOGETHER
