@@ -7,13 +7,9 @@
 
 * gpu: clouds, launches: many clouds at once, also without a GPU
 
-* peers: rate: time for a grasp that passes the same checks, beside other planners
-
 * plan: pace, uncertain: time to grasps, uncertain friction
 
 * scene: real, rooms, target: supports and things in depth images, a given thing among others
-
-* shape: residuals: how bad clouds are
 
 Each bench prints rows, and writes them as JSON and as a Markdown table with commit, machine and
 command. A run that was stopped goes on: rows of the same commit and options are kept in --out.
@@ -27,7 +23,7 @@ import tyro
 from benchmarks.common import Options, measure
 from benchmarks.headline.page import write_headline
 
-SUBJECTS = ("close", "gpu", "headline", "peers", "plan", "scene", "shape")
+SUBJECTS = ("close", "gpu", "headline", "plan", "scene")
 
 
 def command(subject: str) -> Callable[[Options], None]:

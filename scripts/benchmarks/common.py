@@ -73,13 +73,10 @@ class Options:
         scale: factor of the numbers of random samples, scenes, frames, plans and trials.
         draws: trials of each grasp of close/table-lift, with other displacements and noise.
         tries: most grasps that a trial of close/table-lift tries; by default as the protocol says.
-        clouds: folder of real clouds NAME_CAMERA.ply for headline/real and shape/residuals, of one
-            camera each.
+        clouds: folder of real clouds NAME_CAMERA.ply for headline/real, of one camera each.
         planned: folder OBJECT/VIEW.safetensors with grasps for close/table-lift; by default they
             are planned and kept.
         simulator: of close/table-lift.
-        peers: other planners of peers/rate as NAME=PYTHON, with the Python of their environment, or
-            NAME=PYTHON:ADAPTER with a script of your own.
         workers: processes that share the trials.
         threads: of torch.
         beside: commit whose times plan/pace takes in the same run, for ratios; with publish they
@@ -104,7 +101,6 @@ class Options:
     clouds: Path | None = None
     planned: Path | None = None
     simulator: Literal["sapien", "mujoco"] = "sapien"
-    peers: tuple[str, ...] = ()
     workers: int = 1
     threads: int = 1
     beside: str | None = None

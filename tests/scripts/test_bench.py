@@ -15,8 +15,8 @@ from bench import SUBJECTS
 from benchmarks import common
 from benchmarks.common import Options, Row, benches_of, keep_rows, measure, write_section
 from benchmarks.ground_truth import nearest_on_mesh, read_views, sample_hidden
+from benchmarks.headline.accuracy import measure_shape
 from benchmarks.plan import beside, timed
-from benchmarks.shape.accuracy import measure_shape
 from train.bands import fit_factor
 
 from torchgrasp import PointCloud, fit_shape

@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 
 from benchmarks.common import Options, Row, bench, run_all
 from benchmarks.ground_truth import read_cameras
+from benchmarks.headline.accuracy import measure_shape
 from benchmarks.headline.left_out import LEFT_OUT, PACED
 from benchmarks.headline.touched import contact_rows
 from benchmarks.plan.pace import keep_pace
-from benchmarks.shape.accuracy import measure_shape
 from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.data import read_object_mesh, read_view
 from torchgrasp.foundation.errors import GraspError

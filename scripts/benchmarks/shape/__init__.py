@@ -1,1 +1,0 @@
-"""The shape, beside its bars."""
