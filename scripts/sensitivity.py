@@ -40,7 +40,7 @@ OPTIONS = ("Numbers", "Layout")
 """Ends of the names of options values."""
 FACTORS = (1.2, 0.8)
 """Factors by which a number is moved."""
-TOGETHER = 8
+TOGETHER = 32
 """Most numbers that are moved at once, where few have an effect."""
 WAYS = (
     "guarded, grip",

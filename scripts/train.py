@@ -6,6 +6,7 @@
 * stability HAND: which pulled grasps hold, for the impedance control
 * paper_model HAND: the posture model of mode "paper"
 * success: the predicted success that ranks grasps
+* promise DIR: trials on further families that support its promises
 * judge_fresh DIR: how well it predicts later trials, to which its range may be widened
 * occupancy DIR: how likely hidden places of a scene are full
 * bands DIR: how far off hidden sides are
@@ -24,7 +25,7 @@ from train.household import household
 from train.occupancy import occupancy
 from train.paper_model import paper_model
 from train.stability import stability
-from train.success import judge_fresh, success
+from train.success import judge_fresh, promise, success
 from train.trials import trials
 
 from torchgrasp.foundation.errors import GraspError
@@ -36,6 +37,7 @@ if __name__ == "__main__":
             stability,
             paper_model,
             success,
+            promise,
             judge_fresh,
             occupancy,
             bands,

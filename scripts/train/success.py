@@ -77,10 +77,7 @@ def success(
         "calibrated_on": f"{left.sum()} trials of other families",
     }
     if best:
-        tried = read_trials(list_hands(best), workers)
-        tried = tried.select(
-            tried.features[:, FEATURES.index("displaced")] == 0
-        )  # no promise is made of others
+        tried = read_at_rest(best, workers)
         fitted = dataclasses.replace(fitted, kept=keep_trials(fitted, tried))
         print("best grasps:", *judge(fitted, tried), sep="\n")
         about["promised_on"] = f"{len(tried.passed)} trials of best grasps"
@@ -113,6 +110,37 @@ def judge_fresh(
     fitted = dataclasses.replace(fitted, range=torch.stack([low, high], -1))
     about["judged_on"] = f"{len(trials.passed)} later trials, to which the range was widened"
     print(save_tensors(model, KIND, named_tensors(fitted), about))
+
+
+def promise(
+    folders: tyro.conf.Positional[tuple[Path, ...]], workers: int = 1, model: Path = MODEL
+) -> None:
+    """Let trials of best grasps on further families choose the bounds of promises, too; write the
+    model.
+
+    Args:
+        folders: of `scripts/train.py trials --best --objects`.
+        workers: processes that measure the grasps; the features are kept in the folders.
+        model: file of the model.
+    """
+    torch.set_num_threads(1)
+    tried = read_at_rest(folders, workers)
+    fitted, about = read_value(model, KIND, SuccessModel)
+    print(*judge(fitted, tried), sep="\n")
+    further = keep_trials(fitted, tried)
+    # these families are none of those before
+    further[:, 2] += fitted.kept[:, 2].max() + 1
+    fitted = dataclasses.replace(fitted, kept=torch.cat([fitted.kept, further]))
+    about["promised_on"] += f", {len(further)} of scanned and printed objects"
+    print(save_tensors(model, KIND, named_tensors(fitted), about))
+
+
+def read_at_rest(folders: Iterable[Path], workers: int) -> Trials:
+    """Return the trials in which the object was where the planner saw it: no promise is made of
+    others.
+    """
+    tried = read_trials(list_hands(folders), workers)
+    return tried.select(tried.features[:, FEATURES.index("displaced")] == 0)
 
 
 def list_hands(folders: Iterable[Path]) -> list[Path]:

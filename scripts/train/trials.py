@@ -26,6 +26,8 @@ from torchgrasp.campaign.folder import README, Campaign, carry_out
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.sensor import SensorName
 from torchgrasp.contacts.region import Region
+from torchgrasp.data import read_entry, read_object_mesh
+from torchgrasp.data.manifest import read_entries
 from torchgrasp.data.reader import GraspShards
 from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard, short
 from torchgrasp.evaluation.protocols import draw_error, seed_of
@@ -40,6 +42,7 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import surface_field
+from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import measure_grasps
 from torchgrasp.success.model import MODEL, load_success_model
@@ -110,6 +113,20 @@ class Trial(NamedTuple):
     status: Status
 
 
+class Shelf(NamedTuple):
+    """Some objects of a folder that are tried: the k-th body is each in turn, once for each hand."""
+
+    folder: Path
+    names: tuple[str, ...]
+
+    def read(self, k: int) -> HouseholdBody:
+        """Return the k-th body."""
+        name = self.names[k // len(HANDS) % len(self.names)]
+        mesh = read_object_mesh(self.folder, name)
+        family = read_entry(self.folder, name).family
+        return HouseholdBody(name, family, mesh, list(convex_parts(mesh)))
+
+
 def trials(
     folder: tyro.conf.Positional[Path],
     bodies: int = 20 * len(FAMILIES),
@@ -117,6 +134,8 @@ def trials(
     hands: tuple[str, ...] = HANDS,
     first: int = 0,
     best: bool = False,
+    objects: Path | None = None,
+    names: tuple[str, ...] = (),
 ) -> None:
     """Try grasps of all hands on household bodies; what is in the folder is not run again.
 
@@ -128,9 +147,14 @@ def trials(
         first: number of the first body, so that more bodies can follow in a folder of their own.
         best: try the best grasp for ordinary tasks, on bodies of the families that calibrate the
             model.
+        objects: folder of objects that are tried in place of household bodies: each with each hand,
+            then all again from another side.
+        names: objects of this folder; by default all.
     """
+    shelf = None if objects is None else Shelf(objects, names or tuple(read_entries(objects)))
     for hand in hands:
-        counts = run_trials(hand, bodies, folder, workers, first=first, best=best).card["counts"]
+        data = run_trials(hand, bodies, folder, workers, first=first, best=best, shelf=shelf)
+        counts = data.card["counts"]
         print(
             f"{hand}: {counts['tries']} trials on {counts['objects']} bodies, {counts['passed']} passed"
         )
@@ -144,15 +168,17 @@ def run_trials(
     seed: int = 0,
     first: int = 0,
     best: bool = False,
+    shelf: Shelf | None = None,
 ) -> GraspShards:
     """Try grasps of one hand on its share of some bodies from the `first` on, and return the data
-    set.
+    set. The bodies of a `shelf` take the place of household bodies.
     """
     among = range(first, first + bodies)
     numbers = [
         k
         for k in among
-        if k % len(HANDS) == HANDS.index(hand) and (not best or family_of(k) in CALIBRATING)
+        if k % len(HANDS) == HANDS.index(hand)
+        and (not best or shelf is not None or family_of(k) in CALIBRATING)
     ]
     model = load_hand(hand)
     of_hand = {"name": hand, "option": model.source.option, "sha256": model.source.sha256}
@@ -161,6 +187,8 @@ def run_trials(
         "finger_names": ", ".join(model.finger_names),
     }
     trials = {"grasps": BEST + SPREAD, "ranks": "best and spread", "starts": STARTS, "seed": seed}
+    if shelf is not None:
+        trials |= {"objects": list(shelf.names)}
     if best:
         trials |= {"grasps": TASKS, "ranks": "best", "model_sha256": sha256(MODEL)}
     asked = {
@@ -180,7 +208,7 @@ def run_trials(
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, model, 1))
 
     def work(places: Sequence[int]) -> Generator[tuple[int, bytes | Status], None, None]:
-        tasks = [(hand, numbers[place], seed, campaign.meta, best) for place in places]
+        tasks = [(hand, numbers[place], seed, campaign.meta, best, shelf) for place in places]
         run = run_on_cluster if isinstance(workers, str) else run_as_they_end
         return run(try_body, tasks, workers, LIMIT)  # pyright: ignore[reportArgumentType]
 
@@ -196,13 +224,20 @@ def run_trials(
     return data
 
 
-def try_body(hand: str, k: int, seed: int, meta: dict[str, str], best: bool = False) -> bytes:
+def try_body(
+    hand: str,
+    k: int,
+    seed: int,
+    meta: dict[str, str],
+    best: bool = False,
+    shelf: Shelf | None = None,
+) -> bytes:
     """Plan on one view of a body, try its grasps, and return the bytes of a shard with this job
     alone.
     """
     check_versions(meta)
     model = load_hand(hand)
-    body = author_household(k)
+    body = author_household(k) if shelf is None else shelf.read(k)
     draw = np.random.default_rng([seed, k])
     row = JobRow(f"body{k:05d}", "view0", family=body.family)
     try:

@@ -1,7 +1,10 @@
 """The model of success: its fit, its calibration on other families, and the bench that judges it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("sklearn")
 from benchmarks.close import success as bench
@@ -12,11 +15,14 @@ from benchmarks.close.success import (
     judge_promise,
     judge_trials,
 )
+from train import success as fit
 from train.measured import Trials
 from train.success import find_bands, fit_model, judge, keep_trials
 
+from torchgrasp.files import read_value, save_tensors
+from torchgrasp.foundation.base import named_tensors
 from torchgrasp.success.features import FEATURES
-from torchgrasp.success.model import load_success_model
+from torchgrasp.success.model import KIND, SuccessModel, load_success_model
 from torchgrasp.success.promise import Promise
 
 
@@ -81,6 +87,27 @@ def test_the_best_of_a_body_has_the_greatest_prediction_and_promises_know_outcom
     kept = keep_trials(model, others).numpy()
     np.testing.assert_allclose(kept[:, 0], own)
     assert np.array_equal(kept[:, 1] > 0, others.passed) and len(np.unique(kept[:, 2])) == 10
+
+
+def test_trials_on_further_families_support_the_promises_beside_those_before(
+    fitted, tmp_path, monkeypatch
+):
+    model, left, trials, _ = fitted
+    some = trials.select(left)
+    before = dataclasses.replace(model, kept=keep_trials(model, some))
+    path = tmp_path / "model.safetensors"
+    save_tensors(path, KIND, named_tensors(before), {"promised_on": "600 trials of best grasps"})
+    monkeypatch.setattr(fit, "read_at_rest", lambda folders, workers: some)
+    fit.promise((tmp_path,), model=path)
+    after, about = read_value(path, KIND, SuccessModel)
+    count = len(some.passed)
+    assert torch.equal(after.kept[:count], before.kept)
+    assert torch.equal(after.kept[count:, :2], before.kept[:, :2])
+    # the same trials twice are of twice as many families
+    assert len(after.kept[:, 2].unique()) == 2 * len(before.kept[:, 2].unique())
+    assert about["promised_on"].startswith("600 trials of best grasps, ")
+    for name, value in named_tensors(before).items():
+        assert name == "kept" or torch.equal(value, named_tensors(after)[name])
 
 
 def test_bands_contain_the_true_share_and_widen_when_families_differ():

@@ -3,10 +3,13 @@ the same again.
 """
 
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 pytest.importorskip("manifold3d")
 pytest.importorskip("mujoco")
@@ -90,6 +93,24 @@ def test_ordinary_tasks_are_lighter_and_keep_the_planned_friction():
     assert [(x.mass, x.lift, x.displaced) for x in known] == [
         (x.mass, x.lift, x.errs) for x in tasks
     ]
+
+
+def test_each_object_of_a_folder_is_tried_with_each_hand_before_it_comes_again(monkeypatch):
+    box = trimesh.creation.box((0.05, 0.04, 0.06))
+    read = []
+
+    def read_mesh(folder, name):
+        read.append(name)
+        return box
+
+    monkeypatch.setattr(runner, "read_object_mesh", read_mesh)
+    monkeypatch.setattr(runner, "read_entry", lambda _, name: SimpleNamespace(family=name[0]))
+    monkeypatch.setattr(runner, "convex_parts", lambda mesh: [mesh])
+    shelf = runner.Shelf(Path("objects"), ("cup", "pen"))
+    bodies = [shelf.read(k) for k in range(12)]
+    assert read == ["cup"] * 4 + ["pen"] * 4 + ["cup"] * 4
+    assert [body.family for body in bodies[3:5]] == ["c", "p"]
+    assert bodies[0].mesh is box and bodies[0].parts == [box]
 
 
 @pytest.mark.sim

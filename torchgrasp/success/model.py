@@ -2,7 +2,8 @@
 of trials that calibrate it.
 
 `scripts/train.py success` fits the model to trials of authored bodies. Trials of other families
-calibrate it.
+calibrate it. Promises rest on these families, and on those of scanned and printed objects
+(`scripts/train.py promise`).
 """
 
 import dataclasses

@@ -1,8 +1,8 @@
 """A promise: of the grasps that are returned, at least a given share holds, on objects of families
 that nobody tried.
 
-Grasps are returned whose log-odds of success are at least a bound. Families of bodies that the
-model was not fitted on choose the bound, by conformal risk control (Angelopoulos et al., 2024). Let
+Grasps are returned whose log-odds of success are at least a bound. Families of bodies and objects
+that the model was not fitted on choose the bound, by conformal risk control (Angelopoulos et al., 2024). Let
 l_f be the mean of 1[returned] (1[failed] - alpha) over the trials of family f, with alpha = 1 -
 promise. Returned grasps fail more often than promised if and only if E l > 0. A new family has a
 loss of at most 1 - alpha. So the least bound is taken at which
@@ -54,7 +54,7 @@ def describe_promise(share: float) -> str:
         return f"{share:g}, which no trials support"
     return (
         f"{share:g} by {promise.trials} trials of {promise.families} families: pulls and "
-        "lifts of authored bodies"
+        "lifts of authored bodies, and of scanned and printed objects"
     )
 
 
