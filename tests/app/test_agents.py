@@ -18,10 +18,11 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from torchgrasp import Distribution, GraspTask, load_grasps, load_scene
+from torchgrasp import Distribution, GraspTask, load_grasps, load_object, load_scene
 from torchgrasp.app.cli import agent_server
 from torchgrasp.app.cli.agent_files import Workplace
 from torchgrasp.app.cli.agent_tools import (
@@ -380,6 +381,21 @@ def test_an_uncertain_friction_and_mass_are_texts():
     assert make_tool("plan_grasps_from_point_cloud", {"cloud": "jug"}).law == 0.8
     with pytest.raises(BadArgument, match=r"^friction: expected a number, an interval"):
         make_tool("plan_grasps_from_point_cloud", {"cloud": "jug", "friction": "slippery"}).law
+
+
+def test_a_plan_says_from_where_to_look_next_unless_a_grasp_is_likely_enough(tmp_path, monkeypatch):
+    given = {"cloud": "cylinder", "hand": "barrett", "starts": 8}
+    tool = make_tool("plan_grasps_from_point_cloud", given)
+    found = {}
+    for enough in (0.0, 1.0):
+        monkeypatch.setattr("torchgrasp.app.cli.grasp.ENOUGH", enough)
+        found[enough] = tool.run(Workplace.at(tmp_path)).look_next
+    look = found[1.0]
+    assert found[0.0] is None
+    assert look.turn_deg > 45 and look.std_after_m < look.std_before_m
+    eye = torch.tensor(look.obj_from_camera_m)[:3, 3]
+    seen = load_object("cylinder").view.viewpoint
+    assert float(torch.linalg.vector_norm(eye - seen)) > 0.1
 
 
 class Noisy(Tool):

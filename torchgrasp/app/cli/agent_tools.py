@@ -22,7 +22,7 @@ from torchgrasp.app.cli.clouds import CloudCheck
 from torchgrasp.app.cli.command import naming, option, required
 from torchgrasp.app.cli.depth_images import CloudScene
 from torchgrasp.app.cli.doctor import SIMULATORS
-from torchgrasp.app.cli.grasp import ENOUGH, Grasp, read_true_mesh
+from torchgrasp.app.cli.grasp import ENOUGH, Grasp, describe_look, find_look, read_true_mesh
 from torchgrasp.app.cli.hands import TRIAL, describe, find_warnings, list_faults
 from torchgrasp.app.cli.inputs import (
     CLOUD_HELP,
@@ -70,6 +70,7 @@ from torchgrasp.planner.scene_plan import plan_scene
 from torchgrasp.scene.file import read_scene, save_scene
 from torchgrasp.scene.image import is_scene
 from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.second_view import NextView
 from torchgrasp.shape.surface import Surface, extract_surface
 from torchgrasp.success.reasons import explain_success
 from torchgrasp.success.task import GraspTask
@@ -169,6 +170,18 @@ class ThingRow:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class LookRow:
+    """A camera from which a second view would help. Standard deviations are at the contacts."""
+
+    obj_from_camera_m: tuple[tuple[float, ...], ...] = required(
+        "pose of the camera in the frame of the grasps, 4 x 4: x right, y down, z forward"
+    )
+    turn_deg: float | None = required("angle to the nearest earlier camera; null if none is known")
+    std_before_m: float = required("mean standard deviation of the surface now [m]")
+    std_after_m: float = required("the same as expected with the second view [m]")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PlanAnswer(Answer):
     """The result of planning. Without an executable grasp, `explain_empty` says what would help."""
 
@@ -179,6 +192,7 @@ class PlanAnswer(Answer):
     planned: int = required("number of postures that were checked")
     grasps: tuple[GraspRow, ...] = required("the best executable grasps, the best first")
     lowers_success: tuple[str, ...] = option((), "what lowers the success of the best grasp most")
+    look_next: LookRow | None = option(None, "from where a second view would raise the success")
     objects: tuple[ThingRow, ...] = option((), "objects of the scene, if none was chosen")
     grasps_file: str | None = option(None, "all grasps, for close_in_simulation and show")
     json_file: str | None = option(None, "the listed grasps with contacts, forces and torques")
@@ -439,8 +453,9 @@ class _PlanTool(_HandTool):
         ]
         spec = ContactSpec(friction=self.law, table=seen.table)
         surface = extract_surface(told["shape"])
+        look = find_look(told["shape"], grasps, spec)
         run = Run(name, seen.path, cloud, hand, spec, surface, grasps, plan=told.get("plan"))
-        run = dataclasses.replace(run, scene=scene, costs=tuple(costs))
+        run = dataclasses.replace(run, scene=scene, costs=tuple(costs), look=look)
         grasps.save(out / GRASPS)
         files = dict[str, Any](grasps_file=place.tell(out / GRASPS))
         rows = list[GraspRow]()
@@ -463,9 +478,17 @@ class _PlanTool(_HandTool):
             planned=len(grasps),
             grasps=tuple(rows),
             lowers_success=run.costs,
+            look_next=None if look is None else _look_row(look),
             notes=seen.notes,
             **files,
         )
+
+
+def _look_row(view: NextView) -> LookRow:
+    """Return a camera for a second view as a row of an answer."""
+    told = describe_look(view)
+    told["obj_from_camera_m"] = tuple(tuple(row) for row in told["obj_from_camera_m"])
+    return LookRow(**told)
 
 
 def _row(row: dict[str, Any], grasps: Grasps) -> GraspRow:
