@@ -37,7 +37,6 @@ MADE_INSIDE = {
     "JointEstimate",
     "KinematicTree",
     "Link",
-    "Normalisation",
     "Observations",
     "Outlines",
     "PreparedCloud",

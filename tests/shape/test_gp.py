@@ -2,6 +2,7 @@
 kernel's domain.
 """
 
+import math
 from functools import partial
 
 import pytest
@@ -222,3 +223,9 @@ def test_three_points_make_the_papers_psi_indefinite_and_the_default_not():
     noisy = Observations(x, zero, unit(x), torch.arange(3) < 2, zero + 0.01, zero + 2.0)
     with pytest.raises(IndefiniteCovariance):  # generous noise does not hide it
         condition(noisy, *rest, psi_scale=1.0)
+
+
+@pytest.mark.parametrize("scale", [0.0, -0.05, math.nan])
+def test_a_normalised_frame_has_a_positive_scale(scale):
+    with pytest.raises(BadArgument, match=r"^scale: expected a positive number"):
+        Normalisation(torch.zeros(3), scale)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Batch, Value
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.rules import Positive
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.shape.kernel import Queries
 
@@ -23,6 +24,7 @@ normalised.
 """
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Normalisation(Value):
     """A frame for normalised points, which have no unit: x = (point - `center`) / `scale`.
@@ -31,7 +33,9 @@ class Normalisation(Value):
 
     Args:
         center: origin (3,) [m] of the normalised frame, in the cloud's frame.
-        scale: length [m] of one normalised unit.
+        scale: length [m] of one normalised unit, above 0.
+
+    Raises `BadArgument` for another scale.
 
     >>> frame = Normalisation(torch.tensor([0.0, 0.0, 0.1]), scale=0.05)
     >>> frame.normalise(torch.tensor([0.0, 0.0, 0.15])), frame.metres(torch.tensor([0.0, 0.0, 1.0]))
@@ -39,7 +43,7 @@ class Normalisation(Value):
     """
 
     center: Float[Tensor, "3"]
-    scale: float
+    scale: Positive
 
     @checked(gradients=True)
     def normalise(
