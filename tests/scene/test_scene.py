@@ -161,6 +161,15 @@ def test_a_cloud_gives_the_scene_of_its_picture():
     for one in ({"box": box.numpy()}, {"mask": true == 1}):
         with pytest.raises(BadArgument, match="beside"):
             Scene.from_cloud(cloud, **one, point=inside[0])
+    # probabilities of a network, some of which are exactly 1
+    likely = torch.where(true == 1, 0.8, 0.1)
+    likely[torch.nonzero(true == 1)[::3, 0]] = 1.0
+    for wrong, told in (
+        ({"mask": likely}, "mask: expected whole numbers"),
+        ({"point": [1.0, 2.0]}, "point: .*a pixel of a cloud"),
+    ):
+        with pytest.raises(BadArgument, match=told):
+            Scene.from_cloud(cloud, **wrong)
 
 
 def test_a_target_cut_off_at_the_border_is_told(picture):

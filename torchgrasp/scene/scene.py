@@ -227,7 +227,7 @@ class Scene(Value):
         Args:
             cloud: everything that the camera saw, n points [m], with the camera's viewpoint (3,).
             labels: whole numbers (n,), one for each point; 0 means no object.
-            mask: mask (n,) of bool: the points of the target.
+            mask: mask (n,), not 0 at the points of the target.
             box: two opposite corners (2, 3) [m] of a box along the axes of the cloud's frame, which
                 holds the target.
             point: a place on the target, as a point (x, y, z) [m] in the cloud's frame.
@@ -237,8 +237,10 @@ class Scene(Value):
 
         Raises:
             BadArgument: no viewpoint or several; points all around the camera.
-            BadArgument: labels or a mask of another size; a mask or box without points.
-            BadArgument: more than one of labels, mask and box; a mask or box beside a point.
+            BadArgument: labels or a mask of another size; a mask or box without points; a mask of
+                fractions, or of several values beside 0.
+            BadArgument: more than one of labels, mask and box; a mask or box beside a point; a
+                pixel as the point.
             BadArgument: a target, a table or a direction that `from_depth` refuses.
             NoSupport: no plane is found on which objects stand.
 
@@ -251,24 +253,24 @@ class Scene(Value):
             raise BadArgument("mask", "several of mask, labels and box", "one of them")
         if point is not None and (mask is not None or box is not None):
             raise BadArgument("point", "a point beside a mask or a box", "one of them")
+        if point is not None and np.shape(np.asarray(point)) == (2,):
+            raise BadArgument(
+                "point", "a pixel of a cloud, which has none", "a point (x, y, z) [m]"
+            )
         if cloud.viewpoint is None or cloud.viewpoint.ndim != 1:
             found = "none" if cloud.viewpoint is None else "one for each point"
             raise BadArgument("viewpoint", found, "the position of the one camera")
         points = cloud.points.detach().cpu().double()
         viewpoint = cloud.viewpoint.detach().cpu().double()
         given = None if labels is None else read_labels(labels, (len(points),))
-        inside = (
-            None if mask is None else read_labels(torch.as_tensor(mask).long(), (len(points),)) > 0
-        )
+        inside = None if mask is None else read_mask(mask, (len(points),))
         if box is not None:
             corners = torch.as_tensor(np.asarray(box), dtype=torch.float64)
             if corners.shape != (2, 3):
                 raise BadArgument("box", f"shape {tuple(corners.shape)}", "two corners (2, 3)")
             inside = ((points >= corners.amin(0)) & (points <= corners.amax(0))).all(-1)
-        if inside is not None and not bool(inside.any()):
-            raise BadArgument(
-                "mask" if box is None else "box", "no point inside", "one that holds the target"
-            )
+            if not bool(inside.any()):
+                raise BadArgument("box", "no point inside", "one that holds the target")
         supports = find_table(points, viewpoint, table, up, _target(points, inside))
         planes = tuple(support.plane for support in supports)
         image, pixels = image_of_cloud(points, viewpoint, planes[0].normal.double())
