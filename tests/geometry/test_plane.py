@@ -1,10 +1,12 @@
 """Planes and upright frames: they move with what they are made of."""
 
+import dataclasses
+
 import pytest
 import torch
 
 from tests.make import random_motion
-from torchgrasp import ContactSpec, PointCloud, fit_shape
+from torchgrasp import ContactSpec, PointCloud, fit_shape, plan_grasps
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
@@ -86,5 +88,20 @@ def test_a_table_is_finite_and_below_the_object_and_a_normal_has_unit_length(tab
         match=rf"^table: expected .*got a plane {above:.3g} m above the middle of the cloud",
     ):
         fit_shape(cloud, table=0.2)
+    # a table in millimetres, and a camera of a frame whose z axis points down
+    for wrong, height, told in (
+        (cloud, -50.0, "below the object's top"),
+        (
+            dataclasses.replace(cloud, viewpoint=-5 * cloud.viewpoint),
+            -0.3,
+            "the camera .* below it",
+        ),
+    ):
+        for call in (
+            fit_shape,
+            lambda x, table: plan_grasps(x, "barrett", ContactSpec(table=table)),
+        ):
+            with pytest.raises(BadArgument, match=f"^table: expected .*{told}"):
+                call(wrong, table=height)
     tilted = Plane(unit(torch.tensor([0.02, 0.0, 1.0], dtype=F64)), 0.003)
     assert upright_frame(cloud.points, cloud.viewpoint, tilted).isfinite().all()

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import SomeValue, Value, map_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.limits import MAX_EXTENT
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, inverse, real, rigid, rotate
 from torchgrasp.geometry.linalg import norm, unit
@@ -128,7 +129,8 @@ def upright_frame(
     camera. If the camera is straight above, x points to the point farthest from the vertical
     through the points' centroid. The origin is on this vertical, on the table if there is one.
     `viewpoint` [m] is the camera's position, or several, whose mean is taken. Raises `BadArgument`
-    for a table above most points.
+    for a table above most points, above a camera, or more than 2 m (`MAX_EXTENT`) below the highest
+    point.
     """
     points = points.detach().cpu().double()
     centre = points.mean(0)
@@ -137,10 +139,20 @@ def upright_frame(
     if viewpoint is not None:
         eye = viewpoint.detach().cpu().double().reshape(-1, 3).mean(0) - centre
     if table is not None:
-        middle = float(table.height(points).median())
+        heights = table.height(points)
+        middle = float(heights.median())
         if middle < -MOST_ABOVE:
             found = f"a plane {-middle:.3g} m above the middle of the cloud"
             raise BadArgument("table", found, "one under the object")
+        top = float(heights.max())
+        if top > MAX_EXTENT:  # the object would be as high
+            found = f"a plane {top:.3g} m below the object's top"
+            raise BadArgument("table", found, f"one at most {MAX_EXTENT:g} m below it, in metres")
+        if viewpoint is not None:
+            above = float(table.height(viewpoint.detach().cpu().double()).min())
+            if above <= 0:
+                found = f"the camera {-above:.3g} m below it"
+                raise BadArgument("table", found, "a table below the camera")
         z = unit(table.normal.detach().cpu().double())
         centre = centre - table.height(centre) * z
     elif eye is not None and bool(eye.any()):

@@ -147,10 +147,10 @@ def plan_grasps(
 
     Raises:
         BadArgument: an argument of the wrong type or range; an object that is not of graspable
-            size; a scene without a target; `keep` off the object; an `arm` that carries another
-            hand; a `promise` for a displaced object; `shape`, `observer`, `reachable`, `arm` or a
-            region beside several clouds. Errors of files and hands, such as `CloudFileError` and
-            `HandFileError`, are kinds of it.
+            size; a table above a camera, or 2 m below the object; a scene without a target; `keep`
+            off the object; an `arm` that carries another hand; a `promise` for a displaced object;
+            `shape`, `observer`, `reachable`, `arm` or a region beside several clouds. Errors of
+            files and hands, such as `CloudFileError` and `HandFileError`, are kinds of it.
         MissingExtra, NoWorkers: pebble is not installed, or no worker process can start.
 
     If cloud, camera and table are moved together, the grasps move with them. In a scene the hand

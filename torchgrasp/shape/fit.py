@@ -120,7 +120,8 @@ def fit_shape(
             2 sqrt(variance).
 
     Raises:
-        BadArgument: an argument out of range; a table above the object's foot.
+        BadArgument: an argument out of range; a table above the object's foot or a camera, or more
+            than 2 m below the object's top.
         BadArgument: a cloud that `check_cloud` refuses; more than 16 cameras; a view that is not
             wholly in front of its camera; for "camera" a whole surface without normals.
         BadArgument: a kernel whose profile requires a gradient (use `condition`).
