@@ -2,6 +2,8 @@
 none.
 """
 
+import dataclasses
+
 import pytest
 import torch
 import trimesh
@@ -99,6 +101,15 @@ def test_a_box_or_mesh_in_another_frame_is_refused_or_told():
                 plan_grasps(seen, HAND, starts=4, keep=region)
             with pytest.warns(NoEffect, match="avoid changes nothing: one that is .* mm off"):
                 Request(seen, HAND, avoid=region)
+
+
+def test_a_box_to_keep_to_that_holds_everything_is_told():
+    # one in millimetres, of the lower half of the jug
+    for seen in (VIEW, dataclasses.replace(VIEW, viewpoint=None, frustum=None)):
+        with pytest.warns(NoEffect, match="keep changes nothing: it holds all"):
+            Request(seen, HAND, keep=corners([-90.0, -90.0, -5.0], [90.0, 90.0, 75.0]))
+        low = [*(seen.points.amin(0) - 0.01).tolist()[:2], 0.075]
+        Request(seen, HAND, keep=corners(low, [0.1, 0.1, 0.3]))
 
 
 def test_a_region_on_the_seen_or_the_hidden_side_is_at_the_object():

@@ -135,7 +135,7 @@ def check_where(name: str, distance: Callable[[Points], Tensor], cloud: PointClo
 
     The function `distance` returns the signed distances [m] of points [m] in the frame of the
     cloud. Errors call the argument `name`. A region of another `name` raises the warning `NoEffect`
-    instead.
+    instead. So does a region "keep" that holds the whole cloud and the space behind it.
     """
     rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
     seen = cloud.points[rows].double().cpu()
@@ -149,8 +149,12 @@ def check_where(name: str, distance: Callable[[Points], Tensor], cloud: PointClo
         ray = unit(seen - (eye if eye.ndim == 1 else eye[rows]))
         depth = torch.linspace(0, length, AGREEMENT.levels, dtype=seen.dtype)[:, None, None]
         space = (seen + depth * ray).reshape(-1, 3)
-    off = float(distance(space).min())
+    signed = distance(space)
+    off = float(signed.min())
     if off <= room:
+        if name == "keep" and bool((signed < 0).all()):
+            everything = "it holds all of the object's points and the space behind them"
+            warn_user(NoEffect, f"{name} changes nothing: {everything}; expected a part, in metres")
         return
     found = f"one that is {1e3 * off:.0f} mm off the object's points"
     allowed = "a region on the object: in the frame of the cloud, in metres"

@@ -44,7 +44,7 @@ class Region(Value):
         name: name of the region in errors.
         placed: whether the region must be at the object, as a box or a mesh. If it is off the
             cloud and the space behind the cloud, planning raises `BadArgument` for `keep`, and
-            warns `NoEffect` for `avoid`.
+            warns `NoEffect` for `avoid`. If it holds all of both, `keep` warns `NoEffect`.
 
     >>> from torchgrasp import load_object
     >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)

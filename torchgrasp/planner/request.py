@@ -88,7 +88,8 @@ class Request:
         These are an arm of another hand, no load to resist, and a box or mesh to keep to that is
         not at the object. A `promise` (the share of returned grasps that hold) contradicts a
         displaced object.
-        A box or mesh to avoid that is not at the object raises the warning `NoEffect`.
+        A box or mesh to avoid that is not at the object raises the warning `NoEffect`, and so does
+        one to keep to that holds the whole object.
         """
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
             raise BadArgument(
