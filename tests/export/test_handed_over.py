@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.make import near
 from tests.pinch import cylinder, pinch
-from torchgrasp import certify
+from torchgrasp import certify, load_hand
 from torchgrasp.app import cli
 from torchgrasp.cloud import look_at, partial_view, save_cloud
 from torchgrasp.control.finger_forces import squeeze
@@ -25,7 +25,7 @@ from torchgrasp.export import (
     read_foreign,
     save_dexgraspbench,
 )
-from torchgrasp.foundation.errors import BadArgument, GraspFileWarning, Status
+from torchgrasp.foundation.errors import BadArgument, GraspFileWarning, ModelFileError, Status
 
 yaml = pytest.importorskip("yaml")
 
@@ -208,6 +208,10 @@ def test_our_json_and_dexgraspbench_come_back_to_the_same_grasps(tmp_path):
     torch.testing.assert_close(read.pregrasp, grasp.pregrasp)
     near(read.obj_from_hand, grasp.obj_from_hand, 1e-9)
     hand, grasp = pinch("allegro")
+    # the left hand has the same names of joints and links, and the same limits of most joints
+    file.write_text(format_grasps(hand, grasp))
+    with pytest.raises(ModelFileError, match="expected grasps of the allegro_left hand"):
+        read_foreign(file, load_hand("allegro_left"))
     (path,) = save_dexgraspbench(hand, grasp, tmp_path, "x")
     content = np.load(path, allow_pickle=True).item()
     np.savez(tmp_path / "grasps.npz", **content)

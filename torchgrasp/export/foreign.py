@@ -122,8 +122,8 @@ def read_foreign(
             none, "" means the hand's root link, or DexGraspBench's frame of the Allegro hand.
 
     Raises:
-        ModelFileError: the file is missing or malformed, or names a root link that the hand does
-            not have.
+        ModelFileError: the file is missing or malformed, or names another hand, or a root link that
+            the hand does not have.
         ModelFileError: joints fit only with another sign, or do not follow as the hand's joints do.
         BadArgument: the `order` misses an actuated joint, has a name twice, or has a factor that is
             0 or no number.
@@ -200,6 +200,8 @@ def _read_own(
 ) -> ForeignGrasps:
     """Return the grasps of a file of `format_grasps`, given its fields."""
     about = fields["hand"].entries() if "hand" in fields else {}
+    if "name" in about and about["name"].text() != hand.name:
+        raise about["name"].wrong(f"grasps of the {hand.name} hand, which is to read them")
     if root == "" and "root" in about:
         root = about["root"].text()
     renamed = fields["rename"].entries() if "rename" in fields else {}
