@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from torchgrasp import load_scene, read_scene, save_scene
+from torchgrasp.cloud import read_cloud_file
 from torchgrasp.foundation.base import named_tensors
 from torchgrasp.foundation.errors import BadArgument, CloudFileError
 from torchgrasp.scene.image import is_scene
@@ -33,6 +34,17 @@ def test_a_target_that_is_no_label_is_refused(tmp_path, target, error):
     np.savez(path, **dict(np.load(path)) | {"target": np.array(target)})
     with pytest.raises(error):
         read_scene(path)
+
+
+def test_arrays_that_are_not_read_are_told(tmp_path):
+    path = save_scene(load_scene(), tmp_path / "scene.npz")
+    arrays = dict(np.load(path))
+    # other names of the pose and of the unit: without them the frame is the camera's
+    np.savez(path, **arrays, pose=arrays.pop("camera_pose"), depth_scale=0.001)
+    assert "arrays depth_scale, pose were not read" in read_scene(path).notes
+    cloud = tmp_path / "cloud.npz"
+    np.savez(cloud, points=np.random.default_rng(0).random((50, 3)), camera_pose=np.eye(4))
+    assert read_cloud_file(cloud).notes == ("arrays camera_pose were not read",)
 
 
 def test_the_shipped_scene_stands_on_its_table():

@@ -15,7 +15,7 @@ from torchgrasp.cloud.check import MIN_POINTS, check_cloud
 from torchgrasp.cloud.neighbours import NEAR, draw_rows, find_inliers, fit_local_planes
 from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
-from torchgrasp.cloud.safe_files import parse_npy, parse_npz
+from torchgrasp.cloud.safe_files import parse_npy, parse_npz, unread_arrays
 from torchgrasp.cloud.viewpoint import can_see
 from torchgrasp.files import explain, read_bounded, write_file
 from torchgrasp.files.columns import find_columns, parse_text
@@ -105,7 +105,7 @@ def read_cloud(
       points.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `table` (4,),
       `frustum` (4, 3), `pose_error` (n,). For several views: `viewpoint` (n, 3) and `frustum` (n,
-      4, 3).
+      4, 3). Other arrays are not read; a note names them.
     * `.npy`: an array (n, 3), or (n, 6) with normals or colours. Columns 4 to 6 without names are
       normals if they have length 1 and fit the surface of the points. Otherwise they are left out.
     * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the columns of `.npy` as
@@ -187,7 +187,7 @@ def _parse(data: bytes, suffix: str) -> dict[str, Any]:
     if suffix == ".pcd":
         return parse_pcd(data)
     if suffix == ".npz":
-        return parse_npz(data, ARRAYS, "points")
+        return {**parse_npz(data, ARRAYS, "points"), "unread": unread_arrays(data, ARRAYS)}
     return {"columns": parse_npy(data)} if suffix == ".npy" else parse_text(data, suffix)
 
 
@@ -273,6 +273,8 @@ def make_cloud(
             notes.append("columns 4 to 6 are across the surface (colours?) and were left out")
     if arrays.get("other"):
         notes.append(f"columns {', '.join(arrays['other'])[: READ.shown]} were left out")
+    if arrays.get("unread"):
+        notes.append(f"arrays {', '.join(arrays['unread'])[: READ.shown]} were not read")
     points = scale * _as_rows(source, "points", arrays["points"])
     normals = arrays.get("normals")
     normals = None if normals is None else _as_rows(source, "normals", normals)

@@ -66,6 +66,13 @@ def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str
         return {name: parse_npy(archive.read(info)) for name, info in members.items()}
 
 
+def unread_arrays(data: bytes, known: Sequence[str]) -> list[str]:
+    """Return the names of the arrays of a .npz file that are none of the `known`, in their order."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        held = sorted({name.removesuffix(".npy") for name in archive.namelist()})
+    return [name for name in held if name not in known]
+
+
 def read_image_file(name: str, path: Path | str) -> Any:
     """Return the array in a file of a depth image, or of masks.
 

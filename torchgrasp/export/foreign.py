@@ -5,8 +5,6 @@ docs/exchange.md converts it.
 """
 
 import functools
-import io
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -16,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.cloud.safe_files import parse_npz
+from torchgrasp.cloud.safe_files import parse_npz, unread_arrays
 from torchgrasp.contacts.certify import certify
 from torchgrasp.control.law import damped_inverse
 from torchgrasp.export.file_joints import (
@@ -305,11 +303,10 @@ def _bench_tables(path: Path, width: int) -> dict[str, np.ndarray]:
             raise ValueError("no file, or a larger one")
         data = read_bytes(path)
         tables = parse_npz(data, BENCH_READ, "grasp_qpos")
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            held = {name.removesuffix(".npy") for name in archive.namelist()}
+        others = unread_arrays(data, (*BENCH_READ, *BENCH_KNOWN))
     except Exception as error:  # zlib, zipfile and NumPy each raise their own
         raise _refuse(f"{path}: {error}", "an .npz of at most 512 MiB with 'grasp_qpos'") from error
-    if others := sorted(held - {*BENCH_READ, *BENCH_KNOWN}):
+    if others:
         warn_user(GraspFileWarning, f"{path.name}: not read: {', '.join(others)}")
     for name, table in tables.items():
         wanted = POSE_NUMBERS if name == "obj_pose" else width

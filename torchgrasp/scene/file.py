@@ -9,6 +9,7 @@ import torch
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.limits import SHOWN_LETTERS
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import read_arrays
 from torchgrasp.scene.scene import Scene
@@ -36,6 +37,8 @@ def read_scene(path: Path | str) -> Scene:
     * `bounded`: False for an image made of a cloud, whose border is not that of the camera's view.
       If it is missing, it is True.
 
+    Other arrays are not read; `Scene.notes` names them.
+
     Raises `CloudFileError` for no such file, or for malformed content. Raises `BadArgument` for a
     `target` that is no label of an object, or a normal not of length 1. Raises the errors of
     `Scene.from_depth`, too.
@@ -49,6 +52,8 @@ def read_scene(path: Path | str) -> Scene:
     table, pose, target = (arrays.pop(name, None) for name in ("table", "camera_pose", "target"))
     others = arrays.pop("others", np.empty((0, 4)))
     bounded = bool(arrays.pop("bounded", True))
+    unread = arrays.pop("unread")
+    notes = (f"arrays {', '.join(unread)[:SHOWN_LETTERS]} were not read",) if unread else ()
     given = arrays.pop("given", [] if table is not None and "labels" in arrays else None)
     rows = [] if table is None else [table, *others]
     plane, *rest = [Plane(torch.tensor(row[:3]), float(row[3])) for row in rows] or [None]
@@ -57,7 +62,9 @@ def read_scene(path: Path | str) -> Scene:
     )
     own = scene.given if given is None else tuple(label for label in scene.things if label in given)
     image = dataclasses.replace(scene.image, bounded=bounded)
-    scene = dataclasses.replace(scene, image=image, others=(*rest, *scene.others), given=own)
+    others = (*rest, *scene.others)
+    notes = (*notes, *scene.notes)
+    scene = dataclasses.replace(scene, image=image, others=others, given=own, notes=notes)
     return scene if target is None else scene.select(int(target))
 
 

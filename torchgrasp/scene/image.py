@@ -15,7 +15,7 @@ from torch import Tensor
 from torchgrasp.cloud.depth import Array, frustum_of_image, read_depth
 from torchgrasp.cloud.lens import describe
 from torchgrasp.cloud.pose import read_camera_pose
-from torchgrasp.cloud.safe_files import parse_npz
+from torchgrasp.cloud.safe_files import parse_npz, unread_arrays
 from torchgrasp.files import explain, read_bounded
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
@@ -257,6 +257,8 @@ def image_of_cloud(
 def read_arrays(path: Path) -> dict[str, Any]:
     """Return the arrays in a scene's .npz file by name, in the types and shapes that a scene needs.
 
+    The entry `unread` is a list of the names of its other arrays.
+
     Raises `CloudFileError` for a file that is missing or malformed.
     """
     typed = {
@@ -275,6 +277,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
     try:
         arrays = parse_npz(data, names, "depth")
         found = {name: arrays[name] for name in ("depth", "intrinsics")} | arrays
+        unread = unread_arrays(data, names)
         for name in typed.keys() & found.keys():
             kind, shape = typed[name]
             found[name] = found[name].astype(kind, casting="safe").reshape(shape)[()]
@@ -282,7 +285,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
         raise
     except Exception as error:  # zlib, zipfile and numpy each raise their own
         raise CloudFileError("path", f"{path}: {explain(error)}", allowed) from error
-    return found
+    return {**found, "unread": unread}
 
 
 def is_scene(path: Path) -> bool:
