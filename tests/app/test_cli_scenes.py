@@ -256,6 +256,13 @@ def test_what_the_picture_says_against_a_chosen_object_is_told_before_planning(
         and planned[0].target == 2
     )
     assert "advice" not in grasp_on("--label", "1")
+    # what was changed in reading the scene, too
+    wide = np.where(binary_dilation(seen["labels"] == 1, iterations=15), 1, 0)
+    np.savez(tmp_path / "s.npz", **seen | {"labels": wide, "depth_scale": 0.001})
+    words = grasp_on("--label", "1")
+    for note in read_scene(tmp_path / "s.npz").notes:
+        assert f"note    {note}" in words
+    assert "note    arrays depth_scale were not read" in words
 
 
 BAD = {

@@ -370,6 +370,7 @@ class Grasp(ForPrograms):
             progress.end(
                 "scene", f"{len(scene.things)} objects, labels {', '.join(map(str, scene.things))}"
             )
+            inputs.print_notes(scene.notes)
             advice = list(scene.advice)
             if scene.target is not None:
                 judged = judge_things(scene, hand, spec)[scene.target]
