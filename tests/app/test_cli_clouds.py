@@ -28,7 +28,7 @@ from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.cloud.check import remove_outliers
 from torchgrasp.cloud.safe_files import read_image_file
 from torchgrasp.data.shipped import DATA, load_object, load_scene
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.shape.fit import fit_shape
@@ -683,6 +683,15 @@ def test_exr_gives_its_channel_of_depth(tmp_path, monkeypatch):
     channels["Other.Z"] = channels["RGB"]
     with pytest.raises(BadArgument, match="channels"):
         read_image_file("depth", tmp_path / "d.exr")
+
+
+def test_a_depth_file_whose_pose_and_unit_are_not_read_says_so(tmp_path):
+    depth = np.full((4, 6), 700, dtype=np.uint16)
+    np.savez(tmp_path / "bare.npz", depth=depth)
+    assert np.array_equal(read_image_file("depth", tmp_path / "bare.npz"), depth)
+    np.savez(tmp_path / "frame.npz", depth=depth, depth_unit=0.00025, camera_pose=np.eye(4))
+    with pytest.warns(NoEffect, match=r"frame\.npz: arrays camera_pose, depth_unit are not read"):
+        read_image_file("depth", tmp_path / "frame.npz")
 
 
 @pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0)])

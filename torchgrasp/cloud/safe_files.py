@@ -15,9 +15,10 @@ import numpy as np
 
 from torchgrasp.files import Malformed, check_file, explain, read_bytes
 from torchgrasp.files.columns import read_lines
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.foundation.lazy import Image
 from torchgrasp.foundation.limits import CLOUD_BYTES, JSON_BYTES, SHOWN_LETTERS, TOML_BYTES
+from torchgrasp.foundation.told import warn_user
 
 GREY = ("1", "L", "I", "I;16", "I;16B", "F")
 COLOURS = ("P", "RGB", "RGBA")
@@ -77,8 +78,9 @@ def read_image_file(name: str, path: Path | str) -> Any:
     """Return the array in a file of a depth image, or of masks.
 
     Formats are .npy, .npz, .png and .tiff; also .exr for depth, and .json for masks. The argument
-    `name` "depth" has one channel, and is the array `depth` of a .npz file. The argument "mask" may
-    be a picture or several masks, in each form that `torchgrasp.scene.masks.read_labels` takes.
+    `name` "depth" has one channel, and is the array `depth` of a .npz file; other arrays raise the
+    warning `NoEffect`. The argument "mask" may be a picture or several masks, in each form that
+    `torchgrasp.scene.masks.read_labels` takes.
     Raises `BadArgument` for a file of another format, or a malformed one.
     """
     masks = name == "mask"
@@ -90,6 +92,10 @@ def read_image_file(name: str, path: Path | str) -> Any:
             return parse_npy(data)
         if suffix == ".npz":
             arrays = parse_npz(data, () if masks else (name,), "" if masks else name)
+            others = [] if masks else unread_arrays(data, (name,))
+            if others:
+                found = f"{path}: arrays {', '.join(others)[:SHOWN_LETTERS]} are not read"
+                warn_user(NoEffect, f"{found}; give camera, pose and unit as options")
             several = list(arrays.values())
             return arrays.get(name, several[0] if len(several) == 1 else several)
         if suffix == ".json":
