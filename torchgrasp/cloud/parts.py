@@ -104,15 +104,15 @@ def cut_object(
 ) -> tuple[PointCloud, Plane | None]:
     """Return (object, support): the points of one object of a scene, and the plane it stands on.
 
-    The plane is a `Plane` in the frame of the cloud; None if no plane was found. Points on the
-    plane or below it are left out.
+    The plane is a `Plane` in the frame of the cloud; None if no plane was found. Points below the
+    plane, or up to 4 mm (`PARTS.layer`) above it, are left out; in a noisy cloud more are.
 
     Args:
         cloud: points [m] of a scene.
         up: unit vector (3,) that points up, in the frame of the cloud.
         point: position (3,) [m] on or near the object, in the frame of the cloud. Points more than
             0.5 m away (`PARTS.around`) are left out first. None means the object with the most
-            points above the plane.
+            points over the region of the plane.
         box: two opposite corners (2, 3) [m] of a box along the axes of the cloud's frame. Points
             outside are left out first. None means no box.
         gap: distance [m] beyond which points belong to different objects, 0.001 to 1.

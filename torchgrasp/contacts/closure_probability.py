@@ -278,9 +278,10 @@ def closure_probability(
     Monte Carlo.
 
     A fingertip moves along the normal of its contact until it meets a random surface of the
-    Gaussian process. If it meets none within 12 standard deviations of the contact, the set has no
-    force closure on this surface. All contact sets share the random surfaces, and no result depends
-    on another set.
+    Gaussian process. Of several places where the normal enters it, the nearest to the contact
+    counts. If it meets none within 12 standard deviations of the contact, the set has no force
+    closure on this surface. All contact sets use the same random numbers, and no result depends on
+    another set.
 
     Args:
         shape: the uncertain shape, from `fit_shape`.

@@ -171,7 +171,7 @@ def hold_probability(
     * contacts outside the domain of the `shape`, or within 12 mm (`FOOTPRINT`) of its edge.
 
     The result is differentiable twice in contacts, `tilt` and `weight.center`. All contact sets
-    share the random surfaces.
+    use the same random numbers.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts

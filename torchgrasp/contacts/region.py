@@ -116,7 +116,8 @@ class Region(Value):
         """Return the inside of a closed mesh.
 
         `mesh` is a trimesh, or an .obj, .off, .ply or .stl file. It is in metres, in the frame of
-        the cloud. Raises `MeshError` for a mesh that is missing, open, or has no volume.
+        the cloud. Raises `MeshError` for a mesh that is missing, malformed, open, turned inward, or
+        has no volume. Raises `SuspiciousScale` unless its longest side is 5 mm to 2 m.
         """
         solid = read_mesh(mesh)
         surface = surface_distance(

@@ -86,13 +86,14 @@ class TactileState(Value):
         reading: normal force (*b, f) [N].
         forces: full force (*b, f, 3) [N] on the object, friction included.
         contact: mask (*b, f) of the fingertips that touch.
-        points: contact points (*b, f, 3) [m]; NaN without contact.
-        normals: outward unit normals (*b, f, 3) of the object; NaN without contact.
+        points: contact points (*b, f, 3) [m]; NaN where the sample has none. `contact` may lag
+            behind it.
+        normals: outward unit normals (*b, f, 3) of the object; NaN as in `points`.
         lagged: low-passed values (*b, f, 5): normal force [N] (entry 0), full force [N] (1 to 3),
             sliding speed [m/s] (4).
         average: low-passed normal force (*b, f) [N], by which `contact` is decided.
         sliding: sliding speed (*b, f) [m/s].
-        age: time [s] since the last sample.
+        age: time [s] since the last sample was due.
     """
 
     reading: Float[Tensor, "*b f"]

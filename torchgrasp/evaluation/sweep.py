@@ -48,8 +48,8 @@ def evaluate(
     for each view.
 
     The planner sees only the clouds; only the simulator uses the true meshes. An object with bad
-    files or a bad entry gives a score with a `refusal`. Nothing is planned before the first score
-    is asked for.
+    files or a bad entry gives a score with a `refusal`. Scores of objects with a bad entry come
+    first. Nothing is planned before the first score is asked for.
 
     Args:
         objects: folder of objects with its manifest, as `write_objects` makes it.
@@ -68,6 +68,8 @@ def evaluate(
         OutputError: another run holds the folder, or it cannot be written.
         MissingExtra: the simulator is not installed, or pebble for workers.
         NoWorkers: no worker process can start.
+
+    `BadArgument` and `DatasetError` are raised at the call, the others while scores are drawn.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object

@@ -209,8 +209,8 @@ class Status(enum.IntEnum):
     """The outcome of one row of a batch, such as one grasp: success, or the reason of a failure.
 
     A status is an integer: 0 (`OK`) means success, other values are failures. Its `name`, such as
-    "NOT_CLOSED", is short, and its `sentence` explains it. `Status(code)` turns an entry of a
-    `status` tensor into one.
+    "NOT_CLOSED", is short, and its `sentence` explains it. `Status(int(code))` turns an entry of
+    a `status` tensor into one.
 
     >>> Status.NOT_CLOSED.sentence
     'the contacts do not resist every wrench at the planned friction (no frictional form closure)'

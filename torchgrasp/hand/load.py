@@ -109,7 +109,7 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
     """Return the same hand, on the same device, with other grasping fingers.
 
-    The hand's files are read again.
+    The hand's files are read again. A hand that has these fingers already is returned itself.
 
     Args:
         hand: the hand.
@@ -130,8 +130,8 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
 
     Args:
         grasps: grasps of `plan_grasps`, or loaded from a file. Their `meta` names hand and fingers.
-        hand: the same hand with any fingers, its name or its folder. None means the shipped hand
-            that the grasps name.
+        hand: the same hand with any fingers, its name or its folder. None means the hand that
+            the grasps name: a shipped one, or a folder here.
 
     Raises the errors of `load_hand`. Raises `BadArgument` if the grasps name no hand, another hand,
     or unknown fingers.

@@ -103,8 +103,8 @@ def plan_grasps(
               (n, 3). It may also be a cloud of Open3D or trimesh, or a file for `read_cloud` or
               `read_scene`.
             Missing normals and viewpoint are estimated; `cloud_from_array` adds known ones.
-            A sequence of clouds gives a list of `Grasps`. Those of a bad cloud are empty, and their
-              `meta["refused"]` says why.
+            A sequence of clouds gives a list of `Grasps`. Those of a cloud that cannot be planned
+              on are empty, and `meta["refused"]` says why. An unreadable cloud raises.
         hand: from `load_hand`, or its name or folder; it is moved to the device of the cloud.
         spec: constraints; None means `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         starts: number of random initial guesses of the contact planner.
@@ -147,10 +147,10 @@ def plan_grasps(
 
     Raises:
         BadArgument: an argument of the wrong type or range; an object that is not of graspable
-            size; a table above a camera, or 2 m below the object; a scene without a target; `keep`
-            off the object; an `arm` that carries another hand; a `promise` for a displaced object;
-            `shape`, `observer`, `reachable`, `arm` or a region beside several clouds. Errors of
-            files and hands, such as `CloudFileError` and `HandFileError`, are kinds of it.
+            size; a table above most points or a camera, or more than 2 m below the object's top; a
+            scene without a target; `keep` off the object; an `arm` that carries another hand; a
+            `promise` for a displaced object; `shape`, `observer`, `reachable`, `arm` or a region
+            beside several clouds. `CloudFileError` and `HandFileError` are kinds of it.
         MissingExtra, NoWorkers: pebble is not installed, or no worker process can start.
 
     If cloud, camera and table are moved together, the grasps move with them. In a scene the hand

@@ -29,7 +29,8 @@ def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedSce
     Raises:
         BadArgument: the simulator is unknown, or a joint of the hand has no start position or
             drive.
-        HandFileError: the hand's URDF is missing or malformed.
+        HandFileError: the hand's URDF is missing or malformed, or there are too many
+            `self_pairs`.
         MissingExtra: the simulator is not installed.
 
     >>> from torchgrasp import load_hand, load_object
@@ -71,7 +72,8 @@ class SimulatedHand:
         first_touch: timestep (f,) of each fingertip's first contact with the object; infinite
             before it.
         first_stray: timestep (3,) of the hand's first unintended contact: with a neighbour; with
-            the table; of a link that is no fingertip with the object. Infinite before it.
+            the table; with the object, of a link that neither is nor carries a fingertip. Infinite
+            before it.
         stray: sums of the impulses (3,) [N s] of these contacts.
         most_stray: largest force (3,) [N] of these contacts, averaged over a tick.
         period: time [s] of a control tick.

@@ -36,8 +36,9 @@ class StepContacts:
         finger: mask (f,) of the fingers that touch the object, with the fingertip or with the link
             that carries it.
         force: force (f, 3) [N] of each fingertip on the object, with friction.
-        stray: sums (3,) [N s] of the sizes of other normal impulses: of the hand on neighbours, of
-            the hand on the table, and of other links on the object.
+        stray: sums (3,) [N s] of the sizes of the hand's other normal impulses: on neighbours, on
+            the table, on the object. On the object, fingertips and the links that carry them do
+            not count.
     """
 
     impulse: np.ndarray

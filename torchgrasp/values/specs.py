@@ -411,7 +411,8 @@ class TrialSpec(Value):
 
         This is the field `holding`. If that is None, it is "force" in three cases: `force` is
         given, `closing` is not "uncertainty" or "fixed", or a fingertip has no working tactile
-        sensor. Otherwise it is "grip".
+        sensor. Otherwise it is "grip". After the closing "open_loop" the mode is not used: the
+        squeeze is kept.
         """
         default = default_holding(self.sensor, self.closing) if self.force is None else "force"
         return self.holding or default

@@ -175,7 +175,7 @@ def new_hand(
     Args:
         path: the URDF; or an MJCF (.xml, .mjcf), which MuJoCo reads and which becomes a URDF.
         wish: the user's choices, such as the fingertips.
-        seed: seed of the random postures from which the fingertip pads are guessed.
+        seed: seed of the random postures by which pads are guessed and pairs of links are chosen.
         file: name of the file in which the user saves the repaired URDF; the hand.toml names it.
 
     Raises:
