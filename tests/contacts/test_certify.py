@@ -171,3 +171,20 @@ def test_certify_accepts_no_balance_with_a_residual(monkeypatch, residual, close
         module, "solve_by_highs", lambda wrench: (0.01, residual, None, torch.zeros(len(wrench)))
     )
     assert bool(certify(Contacts(spokes(), spokes()), SPEC).closed) is closed
+
+
+def test_highs_decides_the_verdict_where_the_margin_is_the_least_one_allowed(monkeypatch):
+    module = sys.modules["torchgrasp.contacts.certify"]
+    margin = float(certify(Contacts(spokes(), spokes()), SPEC).margin)
+    asked = []
+
+    def highs(wrench):
+        asked.append(len(wrench))
+        return margin, 0.0, None, torch.zeros(len(wrench))
+
+    monkeypatch.setattr(module, "solve_by_highs", highs)
+    for allowed, rows in ((0.5 * margin, 0), (margin, 1), (-margin, 0)):
+        asked.clear()
+        monkeypatch.setattr(module, "MIN_MARGIN", allowed)
+        certify(Contacts(spokes(), spokes()), SPEC)
+        assert len(asked) == rows
