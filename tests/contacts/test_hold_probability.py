@@ -135,7 +135,11 @@ def carried_masses(points, normals, friction, weight, edges=64):
     return None if found[0].x is None else (found[0].x[-1], found[1].x[-1])
 
 
-@pytest.mark.parametrize("law", ["0.05:0.6", "0.1|0.2:0.8"])
+MEASURED = "|".join(f"{0.05 * k:.2f}" for k in range(1, 13))
+"""Twelve masses [kg], more than there are nodes."""
+
+
+@pytest.mark.parametrize("law", ["0.05:0.6", "0.1|0.2:0.8", MEASURED])
 def test_a_mass_counts_by_the_friction_that_it_needs(law, generator):
     contacts = Contacts(*tripods(12, 3))
     mass = Distribution.parse(law)
