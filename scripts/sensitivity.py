@@ -159,6 +159,10 @@ def cases_of(folder: str, objects: Path | None, names: list[str]) -> Iterator[Ca
     """Yield the cases on which the numbers of a folder are tried, the cheapest first."""
     import golden
 
+    if folder in ("geometry", "cloud", "scene"):
+        yield Case("depth image", see_scene)
+    if folder in ("contacts", "shape"):
+        yield Case("probabilities", find_probabilities)
     if folder not in CLOSED:
         for view in (("jug", 1), ("spray", 3)):
             yield Case(f"plan {view}", partial(golden.plan, *view, "allegro", "joint"))
@@ -170,6 +174,43 @@ def cases_of(folder: str, objects: Path | None, names: list[str]) -> Iterator[Ca
     if folder in (*CLOSED, "contacts", "geometry", "hand", "ik", "shape"):
         for how in WAYS:
             yield Case(f"close {how}", partial(golden.close, "jug", "allegro", how))
+
+
+def see_scene() -> str:
+    """Return the hash of the table and the objects that are found in a depth image."""
+    import golden
+
+    from torchgrasp import Scene, load_scene
+
+    image = load_scene().image
+    seen = Scene.from_depth(image.depth, image.intrinsics, image.obj_from_camera)
+    advice = " ".join((*seen.notes, *seen.advice))
+    return golden.digest(str(seen.table), seen.labels, str(seen.noise), advice)
+
+
+def find_probabilities() -> str:
+    """Return the hash of the probabilities of closure and of holding of shipped grasps."""
+    import golden
+
+    from torchgrasp import (
+        CarriedWeight,
+        Distribution,
+        closure_probability,
+        critical_friction,
+        fit_shape,
+        hold_probability,
+        load_object,
+    )
+    from torchgrasp.data.shipped import load_shipped_grasp
+
+    contacts = load_shipped_grasp("jug", "allegro").contacts
+    shape = fit_shape(load_object("jug").view, table=0.0)
+    friction = Distribution.between(0.2, 1.0)
+    weight = CarriedWeight(Distribution.between(0.1, 0.5), contacts.points[0].mean(0), press=4.0)
+    errors = {"placement": 0.002, "tilt": 0.05, "weight": weight}
+    closed = closure_probability(shape, contacts)
+    held = hold_probability(contacts, friction, **errors)
+    return golden.digest(closed.probability, critical_friction(contacts.points, contacts.normals), held)
 
 
 def plan_scene() -> str:
