@@ -145,6 +145,20 @@ def test_any_number_of_workers_gives_the_same_bits_and_a_bad_object_is_refused(f
     assert other.refusal is Status.BAD_OBJECT and "another cloud or hand" in other.note
 
 
+def test_a_view_without_grasps_is_refused_for_what_failed_most_often(folder):
+    grasp = load_shipped_grasp("cylinder", "barrett")
+    failed = grasp[[0, 0, 0, 0, 0]]
+    codes = [Status.TIP_ERROR] * 2 + [Status.OBJECT_COLLISION] * 3
+    failed = dataclasses.replace(failed, status=torch.tensor([int(code) for code in codes]))
+    view = views.ObjectView(folder, "tin", "view0", load_hand("barrett").source)
+    spec = EvaluationSpec(1)
+    found = views.plan_view(view, PROTOCOLS["dexgraspbench"], spec, failed).score
+    assert (found.executable, found.refusal) == (0, Status.OBJECT_COLLISION)
+    mixed = dataclasses.replace(failed, status=failed.status.index_fill(0, torch.tensor(4), 0))
+    found = views.plan_view(view, PROTOCOLS["dexgraspbench"], spec, mixed).score
+    assert (found.executable, found.refusal) == (1, Status.OK)
+
+
 def test_a_second_run_on_the_folder_is_refused_and_a_bad_input_leaves_none(tmp_path, capsys):
     words = [
         "evaluate",

@@ -141,6 +141,7 @@ def test_what_cannot_be_changed_is_not_offered():
     assert not named(
         "friction_margin", "flatness", spec=ContactSpec(friction_margin=1.0, flatness=None)
     )
+    assert not named("friction_margin", spec=ContactSpec(friction=0.0))  # a margin of nothing
     strict = ContactSpec(max_variance=1e-3, flatness=0.1, friction_margin=0.2, separation=0.1)
     assert (
         len(named("=0.03 ", "=0.44 ", "margin=0.5 ", "separation=0.026 ", spec=strict)) == 4

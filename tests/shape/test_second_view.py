@@ -114,7 +114,8 @@ def test_the_chosen_camera_is_above_the_table_and_looks_at_the_object(shape, cho
     # as far away as the first camera
     assert abs(float((eye - middle).norm()) - 0.5) < 0.05
     assert next_view(shape, table=0.0, distance=0.3).turn > 60
-    assert f"{1e3 * chosen.after:.1f} mm" in chosen.sentence
+    before, after = 1e3 * chosen.before, 1e3 * chosen.after
+    assert chosen.sentence.endswith(f"std_m falls from {before:.1f} to {after:.1f} mm")
 
 
 def test_contacts_on_a_flank_are_looked_at_from_there(shape, chosen):
