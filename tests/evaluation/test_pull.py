@@ -4,7 +4,6 @@ takes.
 
 import dataclasses
 import math
-import time
 
 import pytest
 import torch
@@ -63,11 +62,7 @@ def cross(p):
 
 
 def test_a_pinched_cylinder_passes_and_the_same_numbers_come_twice():
-    began = time.process_time()
     first, second = (pull("allegro") for _ in range(2))
-    # CPU seconds of each
-    assert min(first.seconds, second.seconds) > 0
-    assert first.seconds + second.seconds <= time.process_time() - began
     assert first.passed and first.status is Status.OK and first.directions == 6
     assert dataclasses.replace(first, seconds=0.0) == dataclasses.replace(second, seconds=0.0)
     assert 2.0 < first.force < 5.0 and first.moved < 0.02

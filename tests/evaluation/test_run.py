@@ -4,6 +4,7 @@ work.
 
 import dataclasses
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -233,7 +234,9 @@ def test_a_pinched_cylinder_is_lifted():
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
     trial = GraspTrial(hand, grasp, Truth(cylinder(), [cylinder()]))
+    began = time.process_time()
     found = run_protocol(trial, Protocol("quick", QUICK))
+    assert 0 < found.seconds <= time.process_time() - began
     assert found.passed and found.status is Status.OK and found.force > 1.0 and found.moved < 0.01
     assert 0.0 <= found.overlap < 0.003
 
