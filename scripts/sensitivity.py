@@ -210,7 +210,9 @@ def find_probabilities() -> str:
     errors = {"placement": 0.002, "tilt": 0.05, "weight": weight}
     closed = closure_probability(shape, contacts)
     held = hold_probability(contacts, friction, **errors)
-    return golden.digest(closed.probability, critical_friction(contacts.points, contacts.normals), held)
+    return golden.digest(
+        closed.probability, critical_friction(contacts.points, contacts.normals), held
+    )
 
 
 def plan_scene() -> str:
