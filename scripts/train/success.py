@@ -23,6 +23,7 @@ from sklearn.linear_model import LogisticRegression
 from torchgrasp.evaluation import summary as score
 from torchgrasp.files import read_value, save_tensors
 from torchgrasp.foundation.base import named_tensors
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.success.features import CAUSES, FEATURES
 from torchgrasp.success.model import KIND, MODEL, SuccessModel
 from train.household import CALIBRATING
@@ -122,12 +123,17 @@ def promise(
         folders: of `scripts/train.py trials --best --objects`.
         workers: processes that measure the grasps; the features are kept in the folders.
         model: file of the model.
+
+    Raises `BadArgument` for trials that support the promises already.
     """
     torch.set_num_threads(1)
     tried = read_at_rest(folders, workers)
     fitted, about = read_value(model, KIND, SuccessModel)
     print(*judge(fitted, tried), sep="\n")
     further = keep_trials(fitted, tried)
+    # trials that count twice would pass for those of further families
+    if bool(torch.isin(further[:, 0], fitted.kept[:, 0]).all()):
+        raise BadArgument("folders", "trials that support the promises already", "other trials")
     # these families are none of those before
     further[:, 2] += fitted.kept[:, 2].max() + 1
     fitted = dataclasses.replace(fitted, kept=torch.cat([fitted.kept, further]))

@@ -91,7 +91,7 @@ LIMIT = 1800.0
 ABOUT = """---
 license: mit
 ---
-# Grasps of the {hand} hand on household bodies, each tried with a task of its own
+# Grasps of the {hand} hand on {bodies}, each tried with a task of its own
 
 {counts[tries]} trials of {counts[objects]} bodies of {counts[families]} families; {counts[passed]} passed.
 `scripts/train.py trials` makes them. A job is one noisy view of one body, planned on from {starts} starts. Tried
@@ -218,7 +218,12 @@ def run_trials(
     spread = f"{BEST} of its twenty best grasps and {SPREAD} others"
     which = f"the best grasps for {TASKS} ordinary tasks" if best else spread
     about = ABOUT.format(
-        hand=hand, counts=counts, versions=json.dumps(versions()), starts=STARTS, which=which
+        hand=hand,
+        bodies="household bodies" if shelf is None else "given objects",
+        counts=counts,
+        versions=json.dumps(versions()),
+        starts=STARTS,
+        which=which,
     )
     write_file(folder / hand / README, about)
     return data

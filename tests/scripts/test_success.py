@@ -21,6 +21,7 @@ from train.success import find_bands, fit_model, judge, keep_trials
 
 from torchgrasp.files import read_value, save_tensors
 from torchgrasp.foundation.base import named_tensors
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.success.features import FEATURES
 from torchgrasp.success.model import KIND, SuccessModel, load_success_model
 from torchgrasp.success.promise import Promise
@@ -94,20 +95,25 @@ def test_trials_on_further_families_support_the_promises_beside_those_before(
 ):
     model, left, trials, _ = fitted
     some = trials.select(left)
-    before = dataclasses.replace(model, kept=keep_trials(model, some))
+    earlier, _ = draw_trials(count=600, seed=1)
+    before = dataclasses.replace(model, kept=keep_trials(model, earlier))
     path = tmp_path / "model.safetensors"
     save_tensors(path, KIND, named_tensors(before), {"promised_on": "600 trials of best grasps"})
     monkeypatch.setattr(fit, "read_at_rest", lambda folders, workers: some)
     fit.promise((tmp_path,), model=path)
     after, about = read_value(path, KIND, SuccessModel)
-    count = len(some.passed)
+    count = len(earlier.passed)
+    further = keep_trials(model, some)
     assert torch.equal(after.kept[:count], before.kept)
-    assert torch.equal(after.kept[count:, :2], before.kept[:, :2])
-    # the same trials twice are of twice as many families
-    assert len(after.kept[:, 2].unique()) == 2 * len(before.kept[:, 2].unique())
+    assert torch.equal(after.kept[count:, :2], further[:, :2])
+    # families of equal numbers are others
+    families = [len(kept[:, 2].unique()) for kept in (before.kept, further, after.kept)]
+    assert families[2] == families[0] + families[1]
     assert about["promised_on"].startswith("600 trials of best grasps, ")
     for name, value in named_tensors(before).items():
         assert name == "kept" or torch.equal(value, named_tensors(after)[name])
+    with pytest.raises(BadArgument, match=r"^folders: expected other trials"):
+        fit.promise((tmp_path,), model=path)
 
 
 def test_bands_contain_the_true_share_and_widen_when_families_differ():

@@ -68,7 +68,7 @@ def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str
 
 
 def unread_arrays(data: bytes, known: Sequence[str]) -> list[str]:
-    """Return the names of the arrays of a .npz file that are none of the `known`, in their order."""
+    """Return the sorted names of the arrays of a .npz file that are none of the `known`."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         held = sorted({name.removesuffix(".npy") for name in archive.namelist()})
     return [name for name in held if name not in known]
