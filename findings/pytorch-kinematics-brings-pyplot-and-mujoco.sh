@@ -7,8 +7,6 @@ set -euo pipefail
 place="$(mktemp -d)"
 trap 'rm -rf "$place"' EXIT
 python3 -m venv "$place"
-"$place/bin/python" -m pip install -qq --disable-pip-version-check --no-deps torch==2.13.0 \
-    --index-url https://download.pytorch.org/whl/cpu 2> /dev/null || true # else pip's own build below
 "$place/bin/python" -m pip install -qq --disable-pip-version-check pytorch-kinematics==0.10.0 torch==2.13.0 \
     mujoco==3.17.0 matplotlib==3.11.2 numpy==2.4.6
 cat > "$place/try.py" << 'END'

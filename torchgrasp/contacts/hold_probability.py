@@ -60,9 +60,9 @@ TILTS = Range(0.0, math.pi)
 class HoldProbabilityNumbers:
     """Parameters of `hold_probability`."""
 
-    points: int = 32
+    points: int = 64
     """Number of errors around which the critical friction is found and linearised."""
-    local: float = 0.25
+    local: float = 0.2
     """Standard deviation of the errors around each of them, as a share of the whole one: where the
     critical friction has a kink, the result is too high by about as much.
     """
@@ -140,7 +140,7 @@ def hold_probability(
 
     If only the friction is uncertain, the result is exact: the probability that the friction
     exceeds the `critical_friction`, and 0 where that is infinite. The other errors count by the
-    mean over a fixed set of 32 errors. Around each of these, smaller errors count to first order.
+    mean over a fixed set of 64 errors. Around each of these, smaller errors count to first order.
     The result is 0 for the few sets for which the method does not converge; most of them carry a
     load far below the normal forces.
 
