@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from torchgrasp.app.author import Wish, new_hand
+from torchgrasp.app.author.pads import Guess
+from torchgrasp.app.author.sensor_tips import add_seen_sensors, extend_pads
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
+from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.load import hands_folder
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.testing import check_hand, random_joints
@@ -94,6 +98,20 @@ def _turn(rpy):
         step[one, two] = -np.sin(angle)
         turn = step @ turn
     return torch.from_numpy(turn)
+
+
+def test_the_drawn_sensor_is_closed_however_thin_it_is():
+    """A capsule of 1 to 40 mm across lies between the old contact and the new one, with no hole."""
+    before = Pad((0.0, 0.0, 0.03), (0.0, 0.0, 1.0), (0.0, 0.0, 0.02), 0.01)
+    guess = Guess((before,), (np.array([0.0, 0.0, 1.0]),), (0.0, 0.0, 1.0))
+    empty = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    for radius in (0.0005, 0.001, 0.02):
+        (pad,) = extend_pads(["tip"], guess, (0.01,), (radius,), named=True)
+        vertices, faces = add_seen_sensors({"tip": empty}, ["tip"], guess, [pad])["tip"]
+        drawn = trimesh.Trimesh(vertices, faces, process=False)
+        assert drawn.is_volume
+        bounds = [-radius, -radius, 0.03 - 2 * radius], [radius, radius, 0.04]
+        np.testing.assert_allclose(drawn.bounds, bounds, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,10 @@ def add_seen_sensors(
             continue
         end = np.array(pad.center)
         offset = float((np.array(pad.contact) - before.contact) @ way)
-        capsule = trimesh.creation.capsule(offset, pad.radius, count=(SENSOR.sides, SENSOR.sides))
+        # of radius 1 first: trimesh leaves out triangles of less than 1e-8 square units
+        sides = SENSOR.sides, SENSOR.sides
+        capsule = trimesh.creation.capsule(offset / pad.radius, 1.0, count=sides)
+        capsule.apply_scale(pad.radius)
         turn = np.eye(4)
         turn[:3, :3] = np.stack([*_across(way), way], 1)
         # its middle is halfway between the balls, wherever trimesh begins it
