@@ -10,54 +10,24 @@ from typing import Literal, NamedTuple
 from torchgrasp.evaluation.protocols import seed_of
 from torchgrasp.foundation.base import Value, check_whole
 from torchgrasp.foundation.errors import Status
-from torchgrasp.values.specs import ClosingMode, ContactSpec, HoldingMode, Mode
+from torchgrasp.values.specs import ClosingMode, HoldingMode
 
 Support = Literal["camera", "paper"]
-Order = Literal["success", "certain", "risky"]
-"""Which executable grasp comes first: the likeliest success, or the least or greatest sum of
-variances (Sec. 6.5).
-"""
-
-
-@dataclasses.dataclass(frozen=True)
-class Plan(Value):
-    """How grasps are planned: `mode` of `plan_grasps`, support of the shape, and the problem of the
-    contacts.
-
-    `margins` are the library's (`ContactSpec`); without them the problem is the paper's. `variance`
-    is S_thresh; None: that of the problem.
-    """
-
-    mode: Mode = "joint"
-    support: Support = "camera"
-    margins: bool = True
-    variance: float | None = None
-
-    def contacts(self) -> ContactSpec:
-        """Return the problem, for an object that stands on a table at z = 0."""
-        spec = dataclasses.replace(
-            ContactSpec() if self.margins else ContactSpec.paper(), table=0.0
-        )
-        return (
-            spec if self.variance is None else dataclasses.replace(spec, max_variance=self.variance)
-        )
 
 
 @dataclasses.dataclass(frozen=True)
 class Row(Value):
-    """A row of a table: its name, how grasps are planned, which come first, and how the hand closes
-    and holds.
+    """A row of a table: its name, the support of the shape, S_thresh of the contacts (`variance`),
+    and how the hand closes and holds.
 
-    With a `risk`, grasps take part whose contacts lack force closure at the planned friction with at
-    most this probability, by the uncertain shape. Then `first="risky"` is by this probability.
+    The grasps with the greatest sum of variances come first (Sec. 6.5).
     """
 
     name: str
-    plan: Plan
-    first: Order
+    support: Support
+    variance: float
     closing: ClosingMode
     holding: HoldingMode
-    risk: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,12 +43,10 @@ class TableSpec(Value):
         only: names of objects to keep; by default all.
         own: whether the library's own objects take part.
         representatives: take one object of each family, the first by name.
-        finished: make the table of the objects that an earlier call has finished, and run nothing.
         views: views of each object.
         grasps: grasps of each view.
         draws: lifts of each grasp, with an error of the pose each.
         starts: of the contact planner.
-        by_risk: the rows have levels of risk in place of S_thresh.
         workers: processes; the results do not depend on their number.
         seed: of every random draw.
     """
@@ -89,12 +57,10 @@ class TableSpec(Value):
     only: tuple[str, ...] = ()
     own: bool = True
     representatives: bool = False
-    finished: bool = False
     views: int = 1
     grasps: int = 2
     draws: int = 1
     starts: int = 1000
-    by_risk: bool = False
     workers: int = 1
     seed: int = 0
 
@@ -102,10 +68,10 @@ class TableSpec(Value):
         for name in ("views", "grasps", "draws", "starts"):
             check_whole(name, getattr(self, name), 1, 1_000_000)
 
-    def kept(self, kind: str, *what: object) -> Path:
+    def kept(self, kind: str, name: str, *asked: object) -> Path:
         """Return the file, without its ending, in which something of this campaign is kept."""
-        key = seed_of(self.seed, repr((self.starts, *what[1:])))
-        return self.out / kind / f"{what[0]}_{key:016x}"
+        key = seed_of(self.seed, repr((self.starts, *asked)))
+        return self.out / kind / f"{name}_{key:016x}"
 
 
 class Subject(NamedTuple):
@@ -149,9 +115,7 @@ class Lift(Value):
 class Cell(Value):
     """The lifts of one object with one hand in one row.
 
-    `refused` views had no executable grasp; `note` may say why. `std_m` [m] is that of a grasp's
-    least certain contact, a mean over the grasps. `seconds` is the mean CPU time of planning on a
-    view.
+    `refused` views had no executable grasp; `note` may say why.
     """
 
     object: str
@@ -161,8 +125,6 @@ class Cell(Value):
     row: str
     lifts: tuple[Lift, ...]
     refused: int
-    std_m: float
-    seconds: float
     note: str = ""
 
     @property

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from paper.rows import Cell, Plan, Row, TableSpec
+from paper.rows import Cell, Row, TableSpec
 from paper.trials import PAPER, run_cells
 from torchgrasp.evaluation import Share
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
@@ -24,9 +24,6 @@ Asked = Annotated[TableSpec, tyro.conf.arg(name="")]
 
 THRESHOLDS = (0.03, 0.06, 0.10)
 """S_thresh of Table 6."""
-
-RISKS = (0.1, 0.3, 0.5)
-"""Levels of risk in their place: the probability that contacts lack closure at most."""
 
 PUBLISHED = {
     "0.03": "40 63 57",
@@ -49,30 +46,18 @@ OWN: dict[ClosingMode, HoldingMode] = {
 """The closings of Table 7, and how each holds where each holds in its own way."""
 
 
-ROWS6 = tuple(
-    Row(f"{t:.2f}", Plan(support="paper", variance=t), "risky", "uncertainty", "force")
-    for t in THRESHOLDS
-)
+ROWS6 = tuple(Row(f"{t:.2f}", "paper", t, "uncertainty", "force") for t in THRESHOLDS)
 """Rows of Table 6.
 
 The thresholds are variances of the paper's shape: on the completed one hardly any contact reaches
 the first of them.
 """
 ROWS7 = tuple(
-    Row(f"{closing}, {holding}", Plan(variance=THRESHOLDS[0]), "risky", closing, holding)
+    Row(f"{closing}, {holding}", "camera", THRESHOLDS[0], closing, holding)
     for closing, own in OWN.items()
     for holding in dict.fromkeys((FORCE, own))
 )
 """Rows of Table 7, on the library's default shape."""
-
-RISKY = Plan(variance=THRESHOLDS[-1])
-"""The grasps of rows by risk: those of the last threshold, on the library's default shape."""
-RISK_ROWS6 = tuple(
-    Row(f"risk {risk:g}", RISKY, "risky", "uncertainty", "force", risk) for risk in RISKS
-)
-"""Rows of Table 6 by risk."""
-RISK_ROWS7 = tuple(dataclasses.replace(row, plan=RISKY, risk=RISKS[0]) for row in ROWS7)
-"""Rows of Table 7 by risk."""
 
 
 def table6(spec: Asked) -> None:
@@ -84,10 +69,9 @@ def table6(spec: Asked) -> None:
     Args:
         spec: what the table is made of.
     """
-    rows = gather(run_cells(spec, RISK_ROWS6 if spec.by_risk else ROWS6))
+    rows = gather(run_cells(spec, ROWS6))
     numbers = report(rows)
-    places = RISKS if spec.by_risk else THRESHOLDS
-    fall = contrast_over([count_held(row) for row in rows], line_weights(places))
+    fall = contrast_over([count_held(row) for row in rows], line_weights(THRESHOLDS))
     found = "excludes zero" if fall.low > 0 or fall.high < 0 else "does not exclude zero"
     print(
         f"fall of the line from the first to the last: {format_points(fall)}; the interval {found}"
@@ -104,7 +88,7 @@ def table7(spec: Asked) -> None:
     Args:
         spec: what the table is made of.
     """
-    rows = gather(run_cells(spec, RISK_ROWS7 if spec.by_risk else ROWS7))
+    rows = gather(run_cells(spec, ROWS7))
     numbers = report(rows)
     held = {row[0].row: count_held(row) for row in rows}
     alike = [f"{closing}, {FORCE}" for closing in OWN]
@@ -196,7 +180,6 @@ def _numbers(row: Sequence[Cell]) -> dict[str, Any]:
         ),
         "pushed_mm": median(1e3 * x.pushed for _, x in lifts),
         "slip_mm": median(1e3 * x.slip for _, x in lifts if x.held),
-        "std_mm": median(1e3 * cell.std_m for cell in row),
         "objects": len(objects),
         "graspable": sum(objects.values()),
         "lost": dict(Counter(x.status.name for _, x in lifts if not x.held).most_common()),

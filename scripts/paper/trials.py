@@ -1,7 +1,7 @@
 """Campaigns of lifts behind Tables 6 and 7: planned once, kept as files, resumed where they stopped.
 
-A row says how grasps are planned, which of them come first, and how the hand closes and holds. Rows
-share plans where they are the same. Every lift draws the object's pose on its table, unknown to the
+A row says how grasps are planned, and how the hand closes and holds. Rows share plans where they
+are the same. Every lift draws the object's pose on its table, unknown to the
 hand. The draw depends on object, view, rank and repetition only, so that rows are compared under
 the same errors.
 """
@@ -10,16 +10,14 @@ import dataclasses
 import functools
 import json
 import math
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
-from paper.rows import Cell, Lift, Order, Plan, Row, Subject, Support, TableSpec
-from torchgrasp import close_hand, hold_probability, load_grasps, plan_grasps
-from torchgrasp.contacts.closure_probability import well_inside
+from paper.rows import Cell, Lift, Row, Subject, Support, TableSpec
+from torchgrasp import ContactSpec, close_hand, load_grasps, plan_grasps
 from torchgrasp.control.reference import check_single
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
 from torchgrasp.data.shipped import list_objects, load_object
@@ -59,27 +57,12 @@ def run_cells(spec: TableSpec, rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]
     tasks = [
         (spec, tuple(rows), subject, hand) for hand in spec.hands for subject in subjects(spec)
     ]
-    if spec.finished:
-        tasks = [
-            task for task in tasks if all(cell_path(spec, row, *task[2:]).is_file() for row in rows)
-        ]
-    for (_, _, subject, hand), cells in zip(
+    for (*_, subject, hand), cells in zip(
         tasks, run_tasks(fill, tasks, spec.workers, CELL_SECONDS), strict=True
     ):
         if isinstance(cells, Status):
-            lost = Cell(
-                subject.label,
-                subject.family,
-                subject.group,
-                hand,
-                "",
-                (),
-                1,
-                math.nan,
-                math.nan,
-                cells.sentence,
-            )
-            cells = tuple(dataclasses.replace(lost, row=row.name) for row in rows)
+            about = subject.label, subject.family, subject.group, hand
+            cells = tuple(Cell(*about, row.name, (), 1, cells.sentence) for row in rows)
         yield cells
 
 
@@ -105,20 +88,18 @@ def subjects(spec: TableSpec) -> list[Subject]:
     return [subject for k, subject in ranked if not (spec.representatives and k)]
 
 
-def cell_path(spec: TableSpec, row: Row, subject: Subject, hand: str) -> Path:
-    """Return the file in which a cell is kept; rows that differ in their names alone share it."""
-    asked = dataclasses.replace(row, name=""), spec.views, spec.grasps, spec.draws
-    return spec.kept("cells", f"{hand}_{subject.label}", *asked).with_suffix(".json")
-
-
 def fill(
     spec: TableSpec, rows: tuple[Row, ...], subject: Subject, hand_name: str
 ) -> tuple[Cell, ...]:
-    """Return the cells of one object and hand; each is kept as soon as it is there."""
+    """Return the cells of one object and hand; each is kept as soon as it is there.
+
+    Rows that differ in their names alone share a file.
+    """
     bench = _Bench(spec, subject, hand_name)
     cells = []
     for row in rows:
-        path = cell_path(spec, row, subject, hand_name)
+        asked = dataclasses.replace(row, name=""), spec.views, spec.grasps, spec.draws
+        path = spec.kept("cells", f"{hand_name}_{subject.label}", *asked).with_suffix(".json")
         if not path.is_file():
             write_file(path, format_json(dataclasses.asdict(bench.fill(row))))
         cells.append(dataclasses.replace(_read_cell(path), row=row.name))
@@ -126,17 +107,17 @@ def fill(
 
 
 def _read_cell(path: Path) -> Cell:
-    """Read a kept cell."""
-    kept = _with_nan(json.loads(path.read_text("utf-8")), ("std_m", "seconds"))
-    lifts = (_with_nan(lift, ("pushed", "slip")) for lift in kept.pop("lifts"))
-    return Cell(
-        **kept, lifts=tuple(Lift(**lift | {"status": Status[lift["status"]]}) for lift in lifts)
-    )
-
-
-def _with_nan(kept: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
-    """Return a kept record with NaN for null."""
-    return kept | {name: math.nan for name in names if kept[name] is None}
+    """Read a kept cell, with NaN for null."""
+    kept = json.loads(path.read_text("utf-8"))
+    lifts = [
+        Lift(
+            **lift
+            | {"status": Status[lift["status"]]}
+            | {name: math.nan for name in ("pushed", "slip") if lift[name] is None}
+        )
+        for lift in kept.pop("lifts")
+    ]
+    return Cell(**kept, lifts=tuple(lifts))
 
 
 class _Bench:
@@ -172,77 +153,43 @@ class _Bench:
     def fill(self, row: Row) -> Cell:
         """Plan on every view, and lift the first grasps."""
         lifts: list[Lift] = []
-        stds: list[float] = []
-        seconds: list[float] = []
-        notes: list[str] = []
-        refused = 0
+        refusals: list[str] = []
         for view in self.views:
-            grasps, kept = self.plan(view, row.plan)
-            seconds.append(kept["seconds"])
-            if grasps is None or not len(grasps):
-                refused += 1
-                notes.append(kept["note"])
+            planned, why = self.plan(view, row)
+            if planned is None or not len(planned):
+                refusals.append(why)
                 continue
-            if row.risk is None:
-                grasps = in_order(grasps, row.first)
-            else:
-                grasps = self.below_risk(grasps, view, row.plan, row.risk)
-            if not len(grasps):
-                refused += 1
-                notes.append(f"no grasp has a risk of at most {row.risk:g}")
-                continue
-            grasps = grasps[: self.spec.grasps]
-            stds += grasps.contacts.std_m.amax(1).tolist()
+            grasps = riskiest_first(planned)[: self.spec.grasps]
             lifts += [
                 self.lift(row, grasps[rank], view, rank, draw)
                 for rank in range(len(grasps))
                 for draw in range(self.spec.draws)
             ]
-        mean = [sum(x) / len(x) if x else math.nan for x in (stds, seconds)]
-        label = self.subject.label
-        family = self.subject.family
-        group = self.subject.group
-        return Cell(
-            label,
-            family,
-            group,
-            self.hand.name,
-            row.name,
-            tuple(lifts),
-            refused,
-            *mean,
-            "; ".join(notes),
-        )
+        about = self.subject.label, self.subject.family, self.subject.group, self.hand.name
+        return Cell(*about, row.name, tuple(lifts), len(refusals), "; ".join(refusals))
 
-    def plan(self, view: str, plan: Plan) -> tuple[Grasps | None, dict[str, Any]]:
-        """Return the executable grasps of a view, kept or planned, and what is known of the
-        planning.
-        """
-        path = self.spec.kept("plans", f"{self.hand.name}_{self.subject.label}_{view}", plan)
+    def plan(self, view: str, row: Row) -> tuple[Grasps | None, str]:
+        """Return the executable grasps of a view, kept or planned, or why planning failed."""
+        name = f"{self.hand.name}_{self.subject.label}_{view}"
+        path = self.spec.kept("plans", name, row.support, row.variance)
         file = path.with_suffix(".safetensors")
-        record = path.with_suffix(".json")
-        if not record.is_file():
-            started = time.process_time()
-            note = ""
+        reason = path.with_suffix(".txt")
+        if not (file.is_file() or reason.is_file()):
             try:
-                self._plan(view, plan).save(file)
+                self._plan(view, row).save(file)
             except GraspError as error:
-                note = " ".join(str(error).split())
-            write_file(
-                record, format_json({"seconds": time.process_time() - started, "note": note})
-            )
-        return load_grasps(file) if file.is_file() else None, json.loads(record.read_text("utf-8"))
+                write_file(reason, " ".join(str(error).split()))
+        return (load_grasps(file), "") if file.is_file() else (None, reason.read_text("utf-8"))
 
-    def _plan(self, view: str, plan: Plan) -> Grasps:
-        """Plan on a view."""
+    def _plan(self, view: str, row: Row) -> Grasps:
+        """Plan on a view of an object that stands on a table at z = 0."""
         grasps = plan_grasps(
             self.views[view],
             self.hand,
-            plan.contacts(),
+            ContactSpec(max_variance=row.variance, table=0.0),
             self.spec.starts,
             self.spec.seed,
-            mode=plan.mode,
-            shape=self.shape(view, plan.support),
+            shape=self.shape(view, row.support),
         )
         return grasps[grasps.status == Status.OK]
 
@@ -253,19 +200,6 @@ class _Bench:
                 self.views[view], support=support, seed=self.spec.seed, table=0.0
             )
         return self.shapes[view, support]
-
-    def below_risk(self, grasps: Grasps, view: str, plan: Plan, risk: float) -> Grasps:
-        """Return the grasps that lack closure with a probability of at most `risk`, the riskiest
-        ones first. A contact at the edge of the shape's domain counts as a risk of 1.
-        """
-        friction = plan.contacts().planned_friction
-        shape = self.shape(view, plan.support)
-        contacts = grasps.contacts
-        inside = well_inside(shape, contacts)
-        lacks = torch.ones(len(grasps), dtype=torch.float64)
-        lacks[inside] -= hold_probability(contacts[inside], friction, shape=shape).double()
-        order = lacks.argsort(descending=True, stable=True)
-        return grasps[order[lacks[order] <= risk]]
 
     def lift(self, row: Row, grasp: Grasps, view: str, rank: int, draw: int) -> Lift:
         """Close the hand on the true object, somewhere beside where it was seen, and lift it."""
@@ -292,12 +226,10 @@ def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
     return len(contact_order) > 0 and bool(std_m[contact_order[0]] == std_m.min())
 
 
-def in_order(grasps: Grasps, first: Order) -> Grasps:
-    """Return executable grasps in an order; planned ones are by success already."""
-    if first == "success":
-        return grasps
+def riskiest_first(grasps: Grasps) -> Grasps:
+    """Return grasps by the sum of their contacts' variances, the greatest first (Sec. 6.5)."""
     ranked = rank_by_variance(grasps)
-    return ranked if first == "certain" else ranked[torch.arange(len(ranked)).flip(0)]
+    return ranked[torch.arange(len(ranked)).flip(0)]
 
 
 @functools.lru_cache(maxsize=4)

@@ -58,7 +58,7 @@ def steps(monkeypatch):
         if seen.count == seen.stop:
             raise KeyboardInterrupt
 
-    def plan(cloud, hand, spec, starts, seed, *, mode, shape):
+    def plan(cloud, hand, spec, starts, seed, *, shape):
         step()
         _, grasp = pinch(hand.name)
         stds = [torch.full((1, 3), 1e-3 * k, dtype=torch.float64) for k in (1, 2, 3)]

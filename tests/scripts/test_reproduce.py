@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 import torch
-from paper.rows import Plan, Row, TableSpec
-from paper.trials import in_order, most_certain_first, run_cells
+from paper.rows import Row, TableSpec
+from paper.trials import most_certain_first, riskiest_first, run_cells
 
 from tests.pinch import pinch
 from torchgrasp.foundation.base import join
@@ -14,8 +14,8 @@ from torchgrasp.foundation.errors import BadArgument
 
 def test_rows_share_plans_and_errors(steps, tmp_path):
     rows = (
-        Row("one", Plan(), "success", "uncertainty", "force"),
-        Row("two", Plan(), "risky", "position", "position"),
+        Row("one", "camera", 0.03, "uncertainty", "force"),
+        Row("two", "camera", 0.03, "position", "position"),
     )
     spec = TableSpec(tmp_path, hands=("allegro",), only=("cylinder",), draws=2, workers=0)
     ((one, two),) = first = list(run_cells(spec, rows))
@@ -24,13 +24,13 @@ def test_rows_share_plans_and_errors(steps, tmp_path):
     assert list(run_cells(spec, rows)) == first and steps.count == 9
 
 
-def test_in_order_sorts_by_the_sum_of_variances():
+def test_the_riskiest_grasp_has_the_greatest_sum_of_variances():
     _, grasp = pinch("allegro")
     stds = [torch.full((1, 3), 1e-3 * k, dtype=torch.float64) for k in (2, 3, 1)]
     contacts = [dataclasses.replace(grasp.contacts, std_m=std, variance=std**2) for std in stds]
     some = join([dataclasses.replace(grasp, contacts=x) for x in contacts])
-    ranked = [in_order(some, first).contacts.std_m[:, 0].tolist() for first in ("certain", "risky")]
-    assert [[round(1e3 * x) for x in row] for row in ranked] == [[1, 2, 3], [3, 2, 1]]
+    ranked = riskiest_first(some).contacts.std_m[:, 0].tolist()
+    assert [round(1e3 * x) for x in ranked] == [3, 2, 1]
 
 
 def test_the_most_certain_finger_is_told():
