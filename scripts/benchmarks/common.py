@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import torch
 
 from torchgrasp.evaluation.intervals import Share, contrast_over
-from torchgrasp.files import write_file
+from torchgrasp.files import format_json, write_file
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.jobs import run_tasks
 
@@ -187,6 +187,13 @@ def measure(subject: str, options: Options) -> list[Row]:
     }
     write_file(options.out / f"bench_{subject}.json", json.dumps(content, indent=1, default=str))
     return found
+
+
+def keep(path: Path, make: Callable[[], Any]) -> Any:
+    """Return the content of a JSON file, which is made first where it does not exist."""
+    if not path.is_file():
+        write_file(path, format_json(make()))
+    return json.loads(path.read_text("utf-8"))
 
 
 CHOICES = ("only", "out", "publish", "workers")

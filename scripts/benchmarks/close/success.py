@@ -5,18 +5,16 @@ Objects that the model of success was not fitted on are planned on at three fric
 mass of its own. The 20 best grasps and some that follow are pulled at by protocol "dexgraspbench".
 """
 
-import dataclasses
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 
-from benchmarks.close.campaign import folder_of, keep, read_solid, table_spec
-from benchmarks.common import Options, Row, bench, mean_over, run_all
+from benchmarks.close.campaign import read_solid, table_spec
+from benchmarks.common import Options, Row, bench, keep, mean_over, run_all
 from torchgrasp import plan_grasps
-from torchgrasp.data import read_view
 from torchgrasp.evaluation import summary as score
 from torchgrasp.evaluation.intervals import Share, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import PROTOCOLS, seed_of
@@ -70,22 +68,24 @@ def success(o: Options) -> list[Row]:
     """Pull at grasps of objects that the model was not fitted on, and judge their prediction, order
     and promise.
     """
-    spec = dataclasses.replace(table_spec(o), representatives=False)
-    named = list(enumerate(subjects(spec)))
+    spec = table_spec(o, representatives=False)
     tasks = [
         (spec, subject, hand, friction, MASSES[(i + j) % len(MASSES)], o.simulator)
         for (i, subject), hand, (j, friction) in itertools.product(
-            named, o.hands, enumerate(FRICTIONS)
+            enumerate(subjects(spec)), o.hands, enumerate(FRICTIONS)
         )
     ]
-    cells = [Cell(*found) for found in run_all(try_object, tasks, spec.workers, CELL_SECONDS)]
+    return judge_tasks(tasks, o.workers)
+
+
+def judge_tasks(tasks: Sequence[tuple[Any, ...]], workers: int) -> list[Row]:
+    """Return the rows of tasks: the arguments of `try_object`."""
+    cells = [Cell(*found) for found in run_all(try_object, tasks, workers, CELL_SECONDS)]
     planned = [cell for cell in cells if cell.tried]
-    return [
-        Row("views with an executable grasp", "-", f"{len(planned)} of {len(cells)}"),
-        *judge_predictions(planned),
-        *judge_order(planned),
-        *judge_promise(planned),
-    ]
+    rows = [Row("views with an executable grasp", "-", f"{len(planned)} of {len(cells)}")]
+    if planned:
+        rows += judge_predictions(planned) + judge_order(planned) + judge_promise(planned)
+    return rows
 
 
 def try_object(
@@ -108,9 +108,8 @@ def pull_at(
     solid = read_solid(subject)
     patch = base.trial.patch * base.trial.friction / friction
     protocol = base.with_trial(friction=friction, mass=mass, patch=patch, simulator=simulator)
-    cloud = read_view(folder_of(subject), subject.name, solid.view)
     contacts = ContactSpec(friction, table=Plane.horizontal(0.0))
-    grasps = plan_grasps(cloud, model, contacts, spec.starts, spec.seed, task=protocol.task)
+    grasps = plan_grasps(solid.cloud, model, contacts, spec.starts, spec.seed, task=protocol.task)
     good = grasps[grasps.status == Status.OK]
     more = max(len(good) - BEST, 0)
     rest = [BEST + k for k in choose_rows(more, OTHERS, "spread")] if more else []

@@ -17,14 +17,24 @@ from paper.tables6_7 import format_points
 from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
 from train.trials import half_of
 
-from benchmarks.close.campaign import felt_surface, folder_of, keep, read_solid, table_spec
-from benchmarks.common import Options, Row, bench, run_all, timed
+from benchmarks.close.campaign import read_solid, table_spec
+from benchmarks.common import Options, Row, bench, keep, run_all, timed
 from benchmarks.headline.left_out import LEFT_OUT
-from torchgrasp import ContactSpec, PointCloud, Region, Status, close_hand, load_hand, plan_grasps
-from torchgrasp.data import read_view
+from torchgrasp import (
+    ContactSpec,
+    Grasps,
+    PointCloud,
+    Region,
+    Status,
+    close_hand,
+    fit_shape,
+    load_hand,
+    plan_grasps,
+)
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import seed_of
+from torchgrasp.shape.surface import surface_field
 
 
 @bench("headline/region", objects=True)
@@ -32,12 +42,12 @@ def region(o: Options) -> list[Row]:
     """Close the best grasp of a free plan and of one in a region, one object of each family."""
     spec = table_spec(dataclasses.replace(o, names=o.names or LEFT_OUT))
     rows = list[Row]()
-    for hand in spec.hands:
+    for hand in o.hands:
         tasks = [
             (spec, subject, hand, k % 2 == 0, o.simulator)
             for k, subject in enumerate(subjects(spec))
         ]
-        found = run_all(compare, tasks, spec.workers, CELL_SECONDS)
+        found = run_all(compare, tasks, o.workers, CELL_SECONDS)
         rows += _rows(hand, [Found(**fields) for fields in found])
     return rows
 
@@ -78,27 +88,29 @@ def _compare(
     solid = read_solid(subject)
     hand = load_hand(hand_name)
     trial = dataclasses.replace(PROTOCOLS["household"].trial, simulator=simulator, mass=solid.mass)
-    cloud = read_view(folder_of(subject), subject.name, solid.view)
     contact_spec = ContactSpec(trial.friction, table=0.0)
-    region = choose_half(cloud, upper)
+    region = choose_half(solid.cloud, upper)
+    best = list[Grasps]()
     executable = list[int]()
-    status = list[str]()
     seconds = list[float]()
     contacts = torch.zeros(0, 3)
     for chosen in (None, region):
-        plan = partial(plan_grasps, cloud, hand, contact_spec, spec.starts, spec.seed, keep=chosen)
-        grasps, took = timed(plan)
-        seconds.append(took)
+        asked = solid.cloud, hand, contact_spec, spec.starts, spec.seed
+        grasps, took = timed(partial(plan_grasps, *asked, keep=chosen))
         good = grasps[grasps.status == Status.OK]
         contacts = good.contacts.points.reshape(-1, 3)
+        best.append(good[:1])
         executable.append(len(good))
-        seed = seed_of(spec.seed, subject.label)
-        given: dict[str, Any] = {"parts": solid.parts, "surface": felt_surface(subject)}
-        if len(good):
-            done = close_hand(good[0], hand, solid.mesh, trial, seed, **given)
-            status.append(done.status.name)
-        else:
-            status.append("NO_GRASP")
+        seconds.append(took)
+    seed = seed_of(spec.seed, subject.label)
+    surface = surface_field(fit_shape(solid.cloud, table=0.0))
+    given: dict[str, Any] = {"parts": solid.parts, "surface": surface}
+    status = [
+        close_hand(one, hand, solid.mesh, trial, seed, **given).status.name
+        if len(one)
+        else "NO_GRASP"
+        for one in best
+    ]
     inside = int((region(contacts) < 0).sum()) if len(contacts) else 0
     told = "upper half" if upper else "end"
     return Found(subject.family, told, executable, status, seconds, len(contacts), inside)

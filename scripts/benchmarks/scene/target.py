@@ -20,8 +20,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of
 
-from benchmarks.close.campaign import keep
-from benchmarks.common import Options, Row, bench, format_number, mean_over, run_all
+from benchmarks.common import Options, Row, bench, format_number, keep, mean_over, run_all
 from benchmarks.scene.scenes import footprint, separation
 from torchgrasp import ContactSpec, GraspTask, Scene, load_hand, plan_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
