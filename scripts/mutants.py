@@ -9,7 +9,6 @@ mutated module, then the other tests of its folder. A mutant that no test notice
 needs a test, or it changes no behaviour.
 """
 
-import argparse
 import json
 import os
 import random
@@ -21,6 +20,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
 from typing import NamedTuple
+
+import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
 SWAPS = "Add_Sub Sub_Add Mul_Div Div_Mul Pow_Mul BitAnd_BitOr".split()
@@ -102,50 +103,47 @@ def run_tests(copy: Path, module: str, limit: float) -> bool:
     return False
 
 
-def main() -> int:
-    """Try a sample of the mutants of each folder; print the survivors."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument(
-        "--folders", nargs="+", default=["shape", "contacts", "control", "posture_model"]
-    )
-    parser.add_argument(
-        "--each", type=int, default=50, help="mutants of each folder, drawn at random"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument(
-        "--limit", type=float, default=600.0, help="seconds for the tests of one mutant"
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        help="JSON file; mutants that it holds are not tried again",
-    )
-    given = parser.parse_args()
-    chosen = []
-    for folder in given.folders:
+def main(
+    out: Path,
+    folders: tuple[str, ...] = ("shape", "contacts", "control", "posture_model"),
+    each: int = 50,
+    seed: int = 0,
+    workers: int = 2,
+    limit: float = 600.0,
+) -> None:
+    """Try a sample of the mutants of each folder; print the survivors.
+
+    Args:
+        out: JSON file; mutants that it holds are not tried again.
+        folders: folders of the library.
+        each: mutants of each folder, drawn at random.
+        seed: of the draw.
+        workers: processes.
+        limit: seconds for the tests of one mutant.
+    """
+    chosen = list[Mutant]()
+    for folder in folders:
         mutants = all_mutants(folder)
-        chosen += random.Random(given.seed).sample(mutants, min(given.each, len(mutants)))
-    done = json.loads(given.out.read_text()) if given.out.is_file() else []
+        chosen += random.Random(seed).sample(mutants, min(each, len(mutants)))
+    done = json.loads(out.read_text()) if out.is_file() else []
     tried = {(one["module"], one["operator"], one["occurrence"]) for one in done}
     with tempfile.TemporaryDirectory() as scratch:
         copies = Queue[Path]()
-        for k in range(given.workers):
+        for k in range(workers):
             ignore = shutil.ignore_patterns(".git", ".venv", "out", "__pycache__")
             copies.put(Path(shutil.copytree(ROOT, Path(scratch, str(k)), ignore=ignore)))
 
         def work(mutant: Mutant) -> dict[str, object]:
             copy = copies.get()
             try:
-                return try_mutant(copy, mutant, given.limit)
+                return try_mutant(copy, mutant, limit)
             finally:
                 copies.put(copy)
 
-        with ThreadPoolExecutor(given.workers) as pool:
+        with ThreadPoolExecutor(workers) as pool:
             for result in pool.map(work, [mutant for mutant in chosen if mutant not in tried]):
                 done.append(result)
-                given.out.write_text(json.dumps(done, indent=1))
+                out.write_text(json.dumps(done, indent=1))
                 print(
                     "killed  " if result["killed"] else "SURVIVED",
                     result["module"],
@@ -154,8 +152,7 @@ def main() -> int:
                 )
     survivors = [one for one in done if not one["killed"]]
     print(f"{len(survivors)} of {len(done)} mutants survived")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    tyro.cli(main, description=__doc__)

@@ -12,22 +12,21 @@ for a number, so the order of cases is that of cost. Where few numbers have an e
 moved at once.
 """
 
-import argparse
 import ast
 import importlib.abc
 import importlib.machinery
 import importlib.util
 import json
 import multiprocessing
-import re
 import sys
 import warnings
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
+
+import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
 PLANNED = (
@@ -53,9 +52,6 @@ WAYS = (
     "mujoco",
 )
 """Ways to close a hand, of those of `golden.py`."""
-SENSITIVITY = """Each constant and each field of an options value is moved by 20 %, up and then down.
-It acts on plans, a scene and closings.
-A number without effect here is a tolerance, a bound of memory or of a file, or serves a case that is not here."""
 
 
 class Number(NamedTuple):
@@ -155,7 +151,7 @@ class Finder(importlib.abc.MetaPathFinder):
         return importlib.util.spec_from_file_location(fullname, spec.origin, loader=loader)
 
 
-def cases_of(folder: str, objects: Path | None, names: list[str]) -> Iterator[Case]:
+def cases_of(folder: str, objects: Path | None, names: Sequence[str]) -> Iterator[Case]:
     """Yield the cases on which the numbers of a folder are tried, the cheapest first."""
     import golden
 
@@ -166,7 +162,7 @@ def cases_of(folder: str, objects: Path | None, names: list[str]) -> Iterator[Ca
     if folder not in CLOSED:
         for view in (("jug", 1), ("spray", 3)):
             yield Case(f"plan {view}", partial(golden.plan, *view, "allegro", "joint"))
-        for name in names if objects is not None else []:
+        for name in names if objects is not None else ():
             yield Case(f"plan {name}", partial(plan_object, objects, name))
         yield Case("scene", plan_scene)
         yield Case("contact first", partial(golden.plan, "cylinder", 2, "barrett", "contact_first"))
@@ -295,7 +291,7 @@ def that_change(numbers: Sequence[Number], factor: float, case: Case, before: st
     return found
 
 
-def try_folder(folder: str, objects: Path | None, names: list[str]) -> dict[str, str]:
+def try_folder(folder: str, objects: Path | None, names: Sequence[str]) -> dict[str, str]:
     """Return for each number of a folder the first case that it changes, or "no effect"."""
     paths = sorted((ROOT / "torchgrasp" / folder).rglob("*.py"))
     numbers = [number for path in paths for number in numbers_of(path)]
@@ -310,28 +306,20 @@ def try_folder(folder: str, objects: Path | None, names: list[str]) -> dict[str,
     return {number.key: found.get(number, "no effect") for number in numbers}
 
 
-def main() -> int:
-    """Move the numbers of each folder up and down; write what changed."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument(
-        "--objects", type=Path, help="folder of objects with views, in which further plans are made"
-    )
-    parser.add_argument(
-        "--names", nargs="*", default=[], help="objects of the folder that are planned on"
-    )
-    parser.add_argument(
-        "--folders", nargs="*", default=[*PLANNED, *CLOSED], help="folders whose numbers are moved"
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        help="JSON file; folders that it holds are not tried again",
-    )
-    parser.add_argument(
-        "--publish", action="store_true", help="write docs/results/sensitivity.md, too"
-    )
-    given = parser.parse_args()
+def main(
+    out: Path,
+    objects: Path | None = None,
+    names: tuple[str, ...] = (),
+    folders: tuple[str, ...] = (*PLANNED, *CLOSED),
+) -> None:
+    """Move the numbers of each folder up and down; write what changed.
+
+    Args:
+        out: JSON file; folders that it holds are not tried again.
+        objects: folder of objects with views, in which further plans are made.
+        names: objects of this folder that are planned on.
+        folders: folders of the library whose numbers are moved.
+    """
     import lxml.etree  # noqa: F401
     import mujoco  # noqa: F401
     import sapien  # noqa: F401
@@ -341,57 +329,14 @@ def main() -> int:
     import torch  # noqa: F401
     import trimesh  # noqa: F401
 
-    done = json.loads(given.out.read_text()) if given.out.is_file() else {}
-    for folder in given.folders:
+    done = json.loads(out.read_text()) if out.is_file() else {}
+    for folder in folders:
         if not any(key.split(".")[1] == folder for key in done):
-            done |= try_folder(folder, given.objects, given.names)
-            given.out.write_text(json.dumps(done, indent=1))
-    print(
-        f"{sum(value == 'no effect' for value in done.values())} of {len(done)} numbers have no effect"
-    )
-    if given.publish:
-        write_page(done)
-    return 0
-
-
-def write_page(done: dict[str, str]) -> None:
-    """Write docs/results/sensitivity.md: how many numbers have an effect, and the others with their
-    reason.
-    """
-    from benchmarks.common import describe_run
-
-    found = [
-        (*re.fullmatch(r"torchgrasp\.(\S+):(\d+) (.+) \[\d+\]", key).groups(), done[key])
-        for key in done
-    ]  # pyright: ignore
-    every = Counter(module.split(".")[0] for module, *_ in found)
-    silent = Counter(
-        (module.split(".")[0], reason_of(module, int(line)))
-        for module, line, _, effect in found
-        if effect == "no effect"
-    )
-    without = Counter(folder for folder, _ in silent.elements())
-    lines = ["# Numbers", "", "`scripts/sensitivity.py`", "", describe_run(1), "", SENSITIVITY, ""]
-    lines += ["| folder | numbers | without effect |", "| --- | --- | --- |"]
-    lines += [f"| {folder} | {n} | {without[folder]} |" for folder, n in sorted(every.items())]
-    lines += ["", "| folder | numbers without effect | how many |", "| --- | --- | --- |"]
-    lines += [f"| {folder} | {reason} | {n} |" for (folder, reason), n in silent.items()]
-    (ROOT / "docs" / "results" / "sensitivity.md").write_text("\n".join(lines) + "\n")
-
-
-def reason_of(module: str, line: int) -> str:
-    """Return the comment behind or above the number at a line, or the docstring below it."""
-    path = ROOT / "torchgrasp" / Path(*module.split("."))
-    source = (
-        (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text().split("\n")
-    )
-    _, mark, comment = source[line - 1].partition("  # ")
-    below = source[line].strip()
-    above = source[line - 2].strip()
-    if not mark:
-        comment = above[2:] if above.startswith("# ") else below.strip('"')
-    return comment.replace("|", "/")
+            done |= try_folder(folder, objects, names)
+            out.write_text(json.dumps(done, indent=1))
+    silent = sum(value == "no effect" for value in done.values())
+    print(f"{silent} of {len(done)} numbers have no effect")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    tyro.cli(main, description=__doc__)

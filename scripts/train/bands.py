@@ -131,7 +131,7 @@ def measure_ratios(objects: Path, views: Sequence[str] = ()) -> list[Row]:
     """Return `Row`s of every view, or of those with a name in `views`, with and without the table."""
     rows = []
     for name, _, cloud, mesh in read_views(objects, views):
-        hidden = sample_hidden(mesh, cloud, SAMPLES, np.random.default_rng(0))
+        hidden = sample_hidden(mesh, cloud, SAMPLES)
         entry = read_entry(objects, name)
         told = {"family": entry.family, "group": entry.group}
         for table in (0.0, None):

@@ -7,7 +7,12 @@ import trimesh
 from tests.make import field_of_mesh, real
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.field_batch import FieldBatch
-from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.signed_distance import (
+    SignedDistanceField,
+    field_from_surface,
+    surface_distance,
+)
 from torchgrasp.hand.self_collision import box_distance
 
 
@@ -83,6 +88,14 @@ def test_distances_of_open_meshes_do_not_vanish_where_their_sign_jumps():
     field = field_from_surface(vertices, torch.tensor([[0, 1, 2]]), margin=0.0)
     distance, _ = field.query(real([[0.008, 0.008, 0.004]]))
     assert float(distance) == pytest.approx(0.004, abs=1e-6)
+
+
+def test_distances_from_a_mesh_are_those_from_its_triangles(generator):
+    ball = trimesh.creation.icosphere(4, 0.04)
+    points = 0.048 * unit(torch.randn(100, 3, generator=generator, dtype=torch.float64))
+    found = surface_distance(real(ball.vertices), torch.tensor(ball.faces))(points.numpy())
+    naive = trimesh.proximity.closest_point_naive(ball, points.numpy())[1]
+    assert float(abs(found - naive).max()) < 1e-4
 
 
 def test_bad_surfaces_are_named():

@@ -66,11 +66,6 @@ def test_constants_and_fields_of_options_values_are_moved(tmp_path, monkeypatch)
     found = {x.name: x for x in sensitivity.numbers_of(path)}
     assert set(found) == {"REACH", "ClosingNumbers.lead", "ClosingNumbers.tries", "CLOSING"}
     assert {x.module for x in found.values()} == {"torchgrasp.control.closing"}
-    reasons = [
-        sensitivity.reason_of("control.closing", found[name].line)
-        for name in ("REACH", "ClosingNumbers.tries")
-    ]
-    assert reasons == ["how far [m]", "tries before the hand gives up"]
     for name, moved in (("ClosingNumbers.lead", 0.3), ("ClosingNumbers.tries", 14)):
         loader = sensitivity.Moved("closing", str(path))
         loader.numbers = [found[name]]
