@@ -18,7 +18,7 @@ from benchmarks.headline.page import (
     replace_table,
 )
 from benchmarks.headline.shapes import judge_hidden, measure_floor
-from benchmarks.headline.touched import Touch, distance_from, judge_contacts, prefer_measured
+from benchmarks.headline.touched import Touch, distance_from, judge_contacts
 
 from torchgrasp.evaluation import ProtocolResult, ViewScore
 from torchgrasp.foundation.errors import Status
@@ -117,9 +117,3 @@ def test_contacts_on_real_views_are_near_what_was_measured_or_told() -> None:
     assert not judge_contacts("", [*near, Touch(away[2:], away[:1], 0.9)], 0).met
     told = judge_contacts("", [*near, Touch(away[2:], away[2:], 0.9)], 0)
     assert told.met and told.measured.startswith("90% of 10; 1 of the other 1 ")
-
-
-def test_a_grasp_on_measured_surface_is_preferred_within_the_slack() -> None:
-    own = torch.tensor([[0.02, 0.02], [0.001, 0.02], [0.02, 0.002], [0.001, 0.001]])
-    success = torch.tensor([0.9, 0.88, 0.87, 0.6])
-    assert [prefer_measured(own, success, slack) for slack in (0.0, 0.05, 1.0)] == [0, 1, 3]

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from benchmarks.common import Options, Row, bench, run_all
 from benchmarks.ground_truth import read_cameras, sample_hidden
 from benchmarks.headline.left_out import LEFT_OUT, PACED
-from benchmarks.headline.touched import contact_rows
+from benchmarks.headline.touched import contact_row
 from benchmarks.plan.pace import keep_pace
 from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.data import read_object_mesh, read_view
@@ -86,7 +86,7 @@ def real(o: Options) -> list[Row]:
     )
     floor_row = Row("floor: distance of the cameras where both see", "-", words)
     hidden = _hidden(f"{len(found)} real views", found, "<= 3.0 mm")
-    contacts = [row for name in o.hands for row in contact_rows(name, clouds, TABLE, o)]
+    contacts = [contact_row(name, clouds, TABLE, o) for name in o.hands]
     return [hidden, floor_row, *contacts]
 
 

@@ -27,13 +27,6 @@ LEAST = 0.85
 FRICTION = 0.8
 """Friction of the plans."""
 
-CHOICES = {
-    "the best grasp": 0.0,
-    "the grasp of most measured contacts within 0.05 of the best's success": 0.05,
-    "the grasp of most measured contacts": 1.0,
-}
-"""Grasps whose contacts are judged: by how much less likely they may be than the best one."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Touch:
@@ -46,15 +39,13 @@ class Touch:
     success: float
 
 
-def contact_rows(
-    name: str, clouds: dict[str, dict[str, Tensor]], table: float, o: Options
-) -> list[Row]:
-    """Return a row for each of `CHOICES` of the grasps of a hand, planned on each view alone.
+def contact_row(name: str, clouds: dict[str, dict[str, Tensor]], table: float, o: Options) -> Row:
+    """Return the row of the best grasps of a hand, planned on each view alone.
 
     `clouds` holds the points (n, 3) [m] of each thing by camera, on a `table` [m].
     """
     hand = load_hand(name)
-    found: dict[str, list[Touch]] = {choice: [] for choice in CHOICES}
+    found = list[Touch]()
     refused = 0
     for thing, views in clouds.items():
         measured = torch.cat(list(views.values()))
@@ -71,38 +62,20 @@ def contact_rows(
             if not len(good):
                 refused += 1
                 continue
-            contacts = good.contacts.points.double()
-            success = torch.sigmoid(good.score)
-            own = distance_from(points, contacts)
-            for choice, slack in CHOICES.items():
-                k = prefer_measured(own, success, slack)
-                away = distance_from(measured, contacts[k])
-                touch = Touch(away, shape.predict(contacts[k]).std_m, float(success[k]))
-                found[choice].append(touch)
-            print(f"{thing}_{camera}, {name}: {tell(found['the best grasp'][-1])}", flush=True)
-    if not found["the best grasp"]:
-        return [Row(f"contacts on real views, {name}", "-", f"{refused} views without a grasp")]
-    return [
-        judge_contacts(f"contacts of {choice}, {len(some)} real views, {name}", some, refused)
-        for choice, some in found.items()
-    ]
+            contacts = good.contacts.points[0].double()
+            away = distance_from(measured, contacts)
+            std_m = shape.predict(contacts).std_m
+            found.append(Touch(away, std_m, float(torch.sigmoid(good.score[0]))))
+            print(f"{thing}_{camera}, {name}: {tell(found[-1])}", flush=True)
+    if not found:
+        return Row(f"contacts on real views, {name}", "-", f"{refused} views without a grasp")
+    what = f"contacts of the best grasp, {len(found)} real views, {name}"
+    return judge_contacts(what, found, refused)
 
 
 def distance_from(measured: Tensor, points: Tensor) -> Tensor:
-    """Return the distance (..) of each of the points (.., 3) from the nearest measured one [m]."""
-    away = KDTree(measured.numpy()).query(points.reshape(-1, 3).numpy())[0]
-    return torch.from_numpy(away).reshape(points.shape[:-1])
-
-
-def prefer_measured(own: Tensor, success: Tensor, slack: float) -> int:
-    """Return the index of the grasp with most contacts near what its own view measured.
-
-    `own` (g, f) [m] are the distances of the contacts from it. Only grasps count whose `success`
-    (g,), which falls, is at most `slack` below that of the first. Of equal ones the first is taken.
-    """
-    near = (own <= NEAR).sum(1)
-    near[success < success[0] - slack] = -1
-    return 0 if slack == 0 else int(torch.nonzero(near == near.max())[0, 0])
+    """Return the distance (n,) of each of the points (n, 3) from the nearest measured one [m]."""
+    return torch.from_numpy(KDTree(measured.numpy()).query(points.numpy())[0])
 
 
 def tell(touch: Touch) -> str:
