@@ -3,7 +3,6 @@
 
 `torchgrasp hand train` learns the posture model of a hand.
 
-* stability HAND: which pulled grasps hold, for the impedance control
 * paper_model HAND: the posture model of mode "paper"
 * success: the predicted success that ranks grasps
 * promise DIR: trials on further families that support its promises
@@ -24,7 +23,6 @@ from train.bands import bands
 from train.household import household
 from train.occupancy import occupancy
 from train.paper_model import paper_model
-from train.stability import stability
 from train.success import judge_fresh, promise, success
 from train.trials import trials
 
@@ -34,7 +32,6 @@ if __name__ == "__main__":
     commands = {
         x.__name__: x
         for x in (
-            stability,
             paper_model,
             success,
             promise,

@@ -1,7 +1,8 @@
 """The learned stability model, from the paper's reference [6]: Gaussian mixtures over stiffness,
 size and forces of grasps.
 
-`scripts/train.py stability` fits two mixtures to simulated pulls, of stable and of unstable grasps.
+Two mixtures are fitted to simulated pulls, of stable and of unstable grasps (`scripts/train.py
+stability` of commit 94e35b96).
 The first gives the forces of stable grasps and Sigma_fd of Eq. (28). Both give the probability of
 stability by Bayes' rule. The density of stable grasps alone, as in [6], is also low for rare
 objects.
