@@ -10,7 +10,6 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -120,25 +119,14 @@ def household(
     bodies = filter(
         lambda body: body.mesh.extents[2] <= highest, map(author_household, itertools.count(first))
     )
-    write_bodies(folder, {body.name: body.mesh for body in itertools.islice(bodies, count)})
-
-
-def write_bodies(folder: Path, solids: Mapping[str, trimesh.Trimesh]) -> None:
-    """Write bodies by name, FAMILY_NUMBER, as a folder of objects with one noisy view each
-    (`torchgrasp.data`).
-    """
     entries = {}
-    for k, (name, mesh) in enumerate(solids.items()):
-        mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])
-        camera = look_at(GOLDEN_ANGLE * k % 360, 20.0 + 10.0 * (k % 4), target=mesh)
-        cloud = partial_view(mesh, camera, seed=k)
-        pose = np.eye(4)
-        pose[:3, 3] = cloud.viewpoint.numpy()  # pyright: ignore[reportOptionalMemberAccess]
-        (folder / name).mkdir(parents=True, exist_ok=True)
-        write_file(folder / name / "mesh.ply", mesh.export(file_type="ply"))
-        save_cloud(cloud, folder / name / "view0_noisy.ply")
-        entries[name] = {
-            "family": name.split("_")[0],
-            "views": {"view0": {"T_object_camera": pose.tolist()}},
-        }
+    for k, body in enumerate(itertools.islice(bodies, count)):
+        camera = look_at(GOLDEN_ANGLE * k % 360, 20.0 + 10.0 * (k % 4), target=body.mesh)
+        cloud = partial_view(body.mesh, camera, seed=k)
+        place = folder / body.name
+        place.mkdir(parents=True, exist_ok=True)
+        write_file(place / "mesh.ply", body.mesh.export(file_type="ply"))
+        save_cloud(cloud, place / "view0_noisy.ply")
+        pose = {"T_object_camera": camera.tolist()}
+        entries[body.name] = {"family": body.family, "views": {"view0": pose}}
     write_file(folder / "manifest.json", json.dumps({"objects": entries}))

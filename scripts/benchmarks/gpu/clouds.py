@@ -5,12 +5,12 @@ second.
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from benchmarks.common import Options, Row, bench
+from benchmarks.common import Options, Row, bench, timed
 from benchmarks.gpu.launches import views
 from torchgrasp import ContactSpec, Grasps, PointCloud, Status, load_hand, plan_grasps
 from torchgrasp.foundation.checks import checked
@@ -19,7 +19,6 @@ from torchgrasp.planner.many import estimate_shapes, plan_stacks
 from torchgrasp.planner.objects import Objects
 from torchgrasp.planner.request import Request
 
-Result = TypeVar("Result")
 SAME = 1e-6
 """Largest difference of joints [rad] and poses [m, 1] of the same grasp."""
 SPEC = ContactSpec(friction=0.8, table=0.0)
@@ -38,7 +37,7 @@ def plan_clouds(o: Options) -> list[Row]:
     packed = run_tasks(see_view, [(k,) for k in range(max(o.batches))], workers, 600.0)
     seen: list[PointCloud] = [unpack(x) for x in packed]
     requests = [Request(cloud, hand, SPEC, o.starts) for cloud in seen]
-    objects, shaped = timed(lambda: list(estimate_shapes(requests, workers)))
+    objects, shaped = timed(lambda: list(estimate_shapes(requests, workers)), time.perf_counter)
     what = f"shapes of {len(seen)} clouds, {workers} processes"
     rows = [Row(what, "-", f"{shaped:.1f} s", numbers={"s": shaped})]
     plan_at_once(requests[:2], objects[:2], device)  # what a process keeps is made before
@@ -77,18 +76,11 @@ def measure(what: str, plan: Callable[[], list[Grasps]]) -> tuple[Row, list[Gras
     cuda = torch.cuda.is_available()
     if cuda:
         torch.cuda.reset_peak_memory_stats()
-    found, seconds = timed(plan)
+    found, seconds = timed(plan, time.perf_counter)
     memory = torch.cuda.max_memory_allocated() / 2**30 if cuda else 0.0
     rate = sum(int((grasps.status == Status.OK).sum()) for grasps in found) / seconds
     text = f"{rate:.0f} executable a second; {seconds:.2f} s, {memory:.1f} GiB on the GPU"
     return Row(what, "-", text, None, {"seconds": seconds, "rate": rate, "memory": memory}), found
-
-
-def timed(function: Callable[[], Result]) -> tuple[Result, float]:
-    """Return the result of a function, and the wall time [s] that it took."""
-    began = time.perf_counter()
-    result = function()
-    return result, time.perf_counter() - began
 
 
 def compare(what: str, alone: list[Grasps], together: list[Grasps]) -> Row:

@@ -1,18 +1,17 @@
 """How long a person waits for grasps on one core: for the first, for fifty, and for all of a view."""
 
-import numpy as np
 from tqdm import tqdm
 
 from benchmarks.common import Options, Row, bench
 from benchmarks.ground_truth import read_views
-from benchmarks.plan.beside import FRICTIONS, Numbers, compare_with_commit
+from benchmarks.plan.beside import FRICTIONS, MEASURES, Numbers, compare_with_commit, summarise
 from benchmarks.plan.timed import time_stream
 from torchgrasp import load_hand, load_object
 
-BARS = {"first": 0.4, "first, worst decile": 1.0, "fifty": 1.2, "all": 2.2}
-"""Most CPU seconds of the Allegro hand from a cloud to grasps: medians but for the worst decile."""
-RATE = 110.0
-"""Least executable grasps for each CPU second."""
+BARS = (0.4, 1.0, 1.2, 2.2, 110.0)
+"""Bars of the Allegro hand for the first of `MEASURES`: most CPU seconds from a cloud to grasps, and
+least executable grasps for each CPU second.
+"""
 
 
 @bench("plan/pace", objects=True)
@@ -39,36 +38,15 @@ def keep_pace(o: Options) -> list[Row]:
 
 def rows_of(hand: str, objects: int, found: list[Numbers]) -> list[Row]:
     """Return a row for each time and one for the rate; targets are those of the Allegro hand."""
-    names = ("first", "fifty", "all", "grasps")
-    first, fifty, every, count = np.array([[x[name] for name in names] for x in found]).T
-    times = {
-        "first": np.nanmedian(first),
-        "first, worst decile": np.nanquantile(first, 0.9),
-        "fifty": np.nanmedian(fifty),
-        "all": np.median(every),
-    }
     what = f"{hand}, {objects} objects, friction {' and '.join(map(str, FRICTIONS))}"
-    known = hand == "allegro"
-    rows = [
-        Row(
-            f"{what}: {name}",
-            f"{BARS[name]:g} s" if known else "-",
-            f"{x:.2f} s",
-            bool(x <= BARS[name]) if known else None,
-            {"s": float(x)},
-        )
-        for name, x in times.items()
-    ]
-    rate = count.sum() / every.sum()
-    empty = int((count == 0).sum())
-    text = f"{rate:.0f} for each CPU second; {empty} of {len(found)} plans have none"
-    return [
-        *rows,
-        Row(
-            f"{what}: executable grasps",
-            f"{RATE:g}" if known else "-",
-            text,
-            bool(rate >= RATE) if known else None,
-            {"rate": float(rate)},
-        ),
-    ]
+    rows = list[Row]()
+    for (name, text, statistic, unit, _), bar in zip(MEASURES, BARS, strict=False):
+        value = summarise(found, name, statistic)
+        limit, met = "-", None
+        if hand == "allegro":
+            limit = f"{bar:g} {unit}"
+            met = value >= bar if statistic == "rate" else value <= bar
+        measured = f"{value:.2f} {unit}"
+        rows.append(Row(f"{what}: {text}", limit, measured, met, {statistic: value}))
+    empty = sum(x["grasps"] == 0 for x in found)
+    return [*rows, Row(f"{what}: plans without a grasp", "-", f"{empty} of {len(found)}")]
