@@ -67,15 +67,11 @@ class Options:
         views: names of the views that are measured, as view0; by default all.
         hands: names of hands.
         conditions: of close/table-lift; by default all.
-        grasps: grasps of each view, the best or spread over all ranks.
         starts: random starts of the contact planner.
         batches: numbers of clouds of gpu/clouds and gpu/launches.
         scale: factor of the numbers of random samples, scenes, frames, plans and trials.
         draws: trials of each grasp of close/table-lift, with other displacements and noise.
-        tries: most grasps that a trial of close/table-lift tries; by default as the protocol says.
         clouds: folder of real clouds NAME_CAMERA.ply for headline/real, of one camera each.
-        planned: folder OBJECT/VIEW.safetensors with grasps for close/table-lift; by default they
-            are planned and kept.
         simulator: of close/table-lift.
         workers: processes that share the trials.
         threads: of torch.
@@ -92,14 +88,11 @@ class Options:
     views: tuple[str, ...] = ()
     hands: tuple[str, ...] = ("allegro", "barrett")
     conditions: tuple[str, ...] = ()
-    grasps: int = 1
     starts: int = 1000
     batches: tuple[int, ...] = (1, 4, 16)
     scale: float = 1.0
     draws: int = 5
-    tries: int | None = None
     clouds: Path | None = None
-    planned: Path | None = None
     simulator: Literal["sapien", "mujoco"] = "sapien"
     workers: int = 1
     threads: int = 1

@@ -143,13 +143,13 @@ def test_a_view_that_is_timed_is_the_same_in_the_other_process(tin, tmp_path):
 
 def test_a_section_of_a_page_is_replaced(tmp_path):
     page = tmp_path / "page.md"
-    page.write_text("# Page\n\n## Beside a\n\nold\n\n## Other\n\ntext\n")
+    page.write_text("# Page\n\n## Beside a\n\noutdated\n\n## Other\n\ntext\n")
     for measured in ("2", "3"):
         write_section(page, "Beside a", [Row("what", "-", measured)], Options())
     text = page.read_text()
     assert text.startswith("# Page\n\n## Other\n\ntext\n\n## Beside a\n")
     assert text.count("## Beside a") == 1 and text.endswith("| what | - | 3 | - |\n")
-    assert "Commit " in text and "old" not in text
+    assert "Commit " in text and "outdated" not in text
 
 
 def ball(radius: float, n: int) -> torch.Tensor:

@@ -7,7 +7,7 @@ grasp fails.
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,7 @@ from torchgrasp.evaluation import (
     evaluate,
     summarise,
 )
-from torchgrasp.evaluation.intervals import count_by, format_share, share_over
-from torchgrasp.evaluation.protocols import draw_slide, seed_of
+from torchgrasp.evaluation.intervals import format_share
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 
@@ -44,11 +43,6 @@ HANDS = {"barrett": 0.92, "leap": 0.95, "shadow": 0.95}
 """Bars of other hands for the share risen in place; none was set for the share held without slip.
 """
 
-DISTANCES = {(0, 15): None, (15, 30): None, (30, 45): None, (45, 60): 0.75, (60, 75): None}
-"""Distances [mm] by which results of moved objects are told, and the project's bar for the share
-that rose.
-"""
-
 
 @bench("close/table-lift", objects=True)
 def table_lift(o: Options) -> list[Row]:
@@ -61,11 +55,8 @@ def table_lift(o: Options) -> list[Row]:
             strict = 0.0
         protocol = dataclasses.replace(BASE, **changes)
         scores = lift_objects(o, hand, protocol, o.simulator)
-        what = f"{hand.name}, {name}"
-        found = [_row(what, scores, least, strict)]
-        found += _by_distance(what, scores, protocol.noise, o.seed)
-        print(*found, sep="\n", flush=True)
-        rows += found
+        rows.append(_row(f"{hand.name}, {name}", scores, least, strict))
+        print(rows[-1], flush=True)
     return rows
 
 
@@ -74,13 +65,10 @@ def lift_objects(o: Options, hand: Hand, protocol: Protocol, simulator: str) -> 
     with new ones that are then kept.
     """
     noise = dataclasses.replace(protocol.noise, draws=o.draws)
-    tries = o.tries or protocol.tries
-    protocol = dataclasses.replace(protocol, noise=noise, tries=tries).with_trial(
-        simulator=simulator
-    )
+    protocol = dataclasses.replace(protocol, noise=noise).with_trial(simulator=simulator)
     found = []
     for folder in o.objects:
-        shelf = o.planned or o.out / "table-lift" / f"{hand.name}_{folder.name}"
+        shelf = o.out / "table-lift" / f"{hand.name}_{folder.name}"
         here = names_in(folder, o.names)
         if o.names and not here:
             continue
@@ -121,30 +109,6 @@ def _row(what: str, scores: Sequence[ViewScore], least: float, strict: float) ->
     ]
     numbers = {"risen": risen["top1"], "held": held["top1"], "causes": risen["causes"]}
     return Row(what, bar, "; ".join(words), met, numbers | {"not held": lost})
-
-
-def _by_distance(
-    what: str, scores: Sequence[ViewScore], noise: PoseNoise, seed: int
-) -> Iterator[Row]:
-    """Yield the share that rose of the objects that were moved by a distance, for each bin of
-    distances.
-    """
-    if not noise.translation:
-        return
-    tried = [(score, x) for score in scores for x in score.attempts]
-    slides = [
-        draw_slide(noise, seed_of(seed, score.object, score.view, x.rank, x.draw))
-        for score, x in tried
-    ]
-    moved = [1e3 * float(slide.norm()) for slide in slides]
-    for (low, high), least in DISTANCES.items():
-        mine = [at for at, distance in zip(tried, moved, strict=True) if low <= distance < high]
-        if mine:
-            share = share_over(count_by((score.unit, x.passed) for score, x in mine))
-            met = None if least is None else share.value >= least
-            bar = "" if least is None else f">= {least:.0%}"
-            where = f"{what}, {low} to {high} mm"
-            yield Row(where, bar, format_share(share), met, {"share": share})
 
 
 def _strict(score: ViewScore) -> ViewScore:
