@@ -55,13 +55,13 @@ BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 
 def make_scene(
     meshes: dict[str, trimesh.Trimesh], seed: int
-) -> tuple[Scene, list[trimesh.Trimesh], list[str]]:
+) -> tuple[Scene, list[trimesh.Trimesh]]:
     """Return a rendered scene of 5 to 8 objects in its upright frame, the one nearest the middle
     its target.
     """
     rng = np.random.default_rng(seed)
     generator = torch.Generator().manual_seed(seed)
-    names = list(rng.choice(sorted(meshes), int(rng.integers(5, 9)), replace=False))
+    names = rng.choice(sorted(meshes), int(rng.integers(5, 9)), replace=False)
     things = [meshes[name].copy() for name in names]
     radius = float(rng.uniform(0.18, 0.26))
     gap = float(rng.uniform(0.005, 0.03))
@@ -89,7 +89,7 @@ def make_scene(
     frame = upright_frame(cloud.points, cloud.viewpoint, scene.table)
     for mesh in things:
         mesh.apply_transform(inverse(frame).numpy())
-    return scene.to_upright(frame), things, names
+    return scene.to_upright(frame), things
 
 
 def collect(
@@ -98,7 +98,7 @@ def collect(
     """Return features of hidden places and whether they are full, by kind."""
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {kind: [] for kind in KNOTS}
     for seed in seeds:
-        scene, things, _ = make_scene(meshes, seed)
+        scene, things = make_scene(meshes, seed)
         shadows = cast_shadows(scene, scene.target)
         rng = np.random.default_rng(seed)
         own = scene.points[scene.rows_of()]

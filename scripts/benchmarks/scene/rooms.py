@@ -71,23 +71,20 @@ class Room:
         return tuple(found)
 
 
-def rooms(
-    seed: int, kind: str | None = None, sensor: SensorName | None = None, things: int | None = None
-) -> Room:
+def rooms(seed: int, kind: str | None = None, sensor: SensorName | None = None) -> Room:
     """Return a random room.
 
     Args:
         seed: of furniture, things, camera and noise.
         kind: one of `KINDS`; None: in turn.
         sensor: the camera; None: in turn.
-        things: their number; None: 1 to 5.
     """
     kind = kind or list(KINDS)[seed % len(KINDS)]
     sensor = sensor or CAMERAS[(seed // len(KINDS)) % len(CAMERAS)]
     rng = np.random.default_rng((seed, 43))
     generator = torch.Generator().manual_seed(seed)
     furniture, radius, view, tilt = KINDS[kind](rng)
-    names, placed = _things(rng, generator, radius, things)
+    names, placed = _things(rng, generator, radius)
     turn = np.eye(4)
     turn[:3, :3] = rotation_from_vector(torch.tensor(tilt, dtype=torch.float64)).numpy()
     placed = [mesh.apply_transform(turn) for mesh in placed]
@@ -250,10 +247,10 @@ def _camera(
 
 
 def _things(
-    rng: np.random.Generator, generator: torch.Generator, radius: float, count: int | None
+    rng: np.random.Generator, generator: torch.Generator, radius: float
 ) -> tuple[list[str], list[trimesh.Trimesh]]:
-    """Return the names and the meshes of random things that stand apart on z = 0."""
-    count = count or int(rng.integers(1, 6))
+    """Return the names and the meshes of one to five random things that stand apart on z = 0."""
+    count = int(rng.integers(1, 6))
     while True:
         names = [str(name) for name in rng.choice(list(THINGS), count)]
         meshes = [THINGS[name](rng) for name in names]

@@ -2,10 +2,9 @@
 size and forces of grasps.
 
 Two mixtures are fitted to simulated pulls, of stable and of unstable grasps (`scripts/train.py
-stability` of commit 94e35b96).
-The first gives the forces of stable grasps and Sigma_fd of Eq. (28). Both give the probability of
-stability by Bayes' rule. The density of stable grasps alone, as in [6], is also low for rare
-objects.
+stability` of commit 94e35b96). The first gives the forces of stable grasps and Sigma_fd of Eq. (28).
+Both give the probability of stability by Bayes' rule. The density of stable grasps alone, as in
+[6], is also low for rare objects.
 """
 
 import dataclasses
