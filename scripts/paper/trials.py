@@ -12,7 +12,7 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 PAPER = PROTOCOLS["paper"]
 
 MASS = 0.1
-"""Mass of objects that come without one [kg]: a light household object."""
+"""Mass of objects that are not the library's own [kg]: a light household object."""
 
 CELL_SECONDS = 3600.0
 """Wall time [s] after which an object is given up: many times the usual."""
@@ -120,6 +120,27 @@ def _read_cell(path: Path) -> Cell:
     return Cell(**kept, lifts=tuple(lifts))
 
 
+class Solid(NamedTuple):
+    """An object: its true mesh, convex parts and mass [kg] if it is known, and noisy views by name."""
+
+    mesh: "trimesh.Trimesh"
+    parts: "Sequence[trimesh.Trimesh]"
+    mass: float | None
+    views: dict[str, PointCloud]
+
+
+@functools.lru_cache(maxsize=2)
+def read_solid(subject: Subject) -> Solid:
+    """Return an object of a folder, or the library's own."""
+    folder, name = subject.folder, subject.name
+    if folder is None:
+        own = load_object(name)
+        return Solid(own.mesh, own.parts, own.mass, {"view": own.view})
+    mesh = read_object_mesh(folder, name)
+    views = {view: read_view(folder, name, view) for _, view in list_views(folder, only=[name])}
+    return Solid(mesh, convex_parts(mesh), read_entry(folder, name).mass, views)
+
+
 class _Bench:
     """One object and one hand. What a row needs is loaded or planned when the first row asks for
     it.
@@ -129,32 +150,14 @@ class _Bench:
         self.spec = spec
         self.subject = subject
         self.hand = _load_hand(hand_name)
+        self.solid = read_solid(subject)
         self.shapes: dict[tuple[str, Support], ShapeGP] = {}
-
-    @functools.cached_property
-    def solid(self) -> "tuple[trimesh.Trimesh, Sequence[trimesh.Trimesh], float]":
-        """Return the true mesh, its convex parts and its mass."""
-        if self.subject.folder is None:
-            own = load_object(self.subject.name)
-            return own.mesh, own.parts, own.mass
-        mesh = read_object_mesh(self.subject.folder, self.subject.name)
-        return mesh, convex_parts(mesh), MASS
-
-    @functools.cached_property
-    def views(self) -> dict[str, PointCloud]:
-        """Return the noisy views by name."""
-        folder = self.subject.folder
-        name = self.subject.name
-        if folder is None:
-            return {"view": load_object(name).view}
-        views = [view for _, view in list_views(folder, only=[name])][: self.spec.views]
-        return {view: read_view(folder, name, view) for view in views}
 
     def fill(self, row: Row) -> Cell:
         """Plan on every view, and lift the first grasps."""
         lifts: list[Lift] = []
         refusals: list[str] = []
-        for view in self.views:
+        for view in list(self.solid.views)[: self.spec.views]:
             planned, why = self.plan(view, row)
             if planned is None or not len(planned):
                 refusals.append(why)
@@ -184,7 +187,7 @@ class _Bench:
     def _plan(self, view: str, row: Row) -> Grasps:
         """Plan on a view of an object that stands on a table at z = 0."""
         grasps = plan_grasps(
-            self.views[view],
+            self.solid.views[view],
             self.hand,
             ContactSpec(max_variance=row.variance, table=0.0),
             self.spec.starts,
@@ -197,13 +200,14 @@ class _Bench:
         """Return the shape of a view."""
         if (view, support) not in self.shapes:
             self.shapes[view, support] = fit_shape(
-                self.views[view], support=support, seed=self.spec.seed, table=0.0
+                self.solid.views[view], support=support, seed=self.spec.seed, table=0.0
             )
         return self.shapes[view, support]
 
     def lift(self, row: Row, grasp: Grasps, view: str, rank: int, draw: int) -> Lift:
         """Close the hand on the true object, somewhere beside where it was seen, and lift it."""
-        mesh, parts, mass = self.solid
+        mesh, parts, mass, _ = self.solid
+        mass = mass if self.subject.folder is None else MASS
         seed = seed_of(self.spec.seed, self.subject.label, view, rank, draw)
         trial = dataclasses.replace(
             PAPER.trial, closing=row.closing, holding=row.holding, mass=mass

@@ -10,9 +10,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from paper.trials import CELL_SECONDS, Subject, TableSpec, subjects
+from paper.trials import CELL_SECONDS, Subject, TableSpec, read_solid, subjects
 
-from benchmarks.close.campaign import read_solid, table_spec
 from benchmarks.common import Options, Row, bench, keep, mean_over, run_all
 from torchgrasp import plan_grasps
 from torchgrasp.evaluation import summary as score
@@ -63,6 +62,19 @@ class Cell(NamedTuple):
         return [x for x in self.tried if x[0] < BEST]
 
 
+def table_spec(o: Options, representatives: bool) -> TableSpec:
+    """Return the campaign that some options ask for, of one object of each family or of all."""
+    return TableSpec(
+        o.out,
+        o.objects,
+        only=o.names,
+        own=False,
+        representatives=representatives,
+        starts=o.starts,
+        seed=o.seed,
+    )
+
+
 @bench("close/success", objects=True)
 def success(o: Options) -> list[Row]:
     """Pull at grasps of objects that the model was not fitted on, and judge their prediction, order
@@ -109,7 +121,8 @@ def pull_at(
     patch = base.trial.patch * base.trial.friction / friction
     protocol = base.with_trial(friction=friction, mass=mass, patch=patch, simulator=simulator)
     contacts = ContactSpec(friction, table=Plane.horizontal(0.0))
-    grasps = plan_grasps(solid.cloud, model, contacts, spec.starts, spec.seed, task=protocol.task)
+    cloud = next(iter(solid.views.values()))
+    grasps = plan_grasps(cloud, model, contacts, spec.starts, spec.seed, task=protocol.task)
     good = grasps[grasps.status == Status.OK]
     more = max(len(good) - BEST, 0)
     rest = [BEST + k for k in choose_rows(more, OTHERS, "spread")] if more else []

@@ -4,8 +4,7 @@ import dataclasses
 
 from paper.trials import subjects
 
-from benchmarks.close.campaign import table_spec
-from benchmarks.close.success import FRICTIONS, MASSES, judge_tasks
+from benchmarks.close.success import FRICTIONS, MASSES, judge_tasks, table_spec
 from benchmarks.common import Options, Row, bench
 from benchmarks.headline.left_out import LEFT_OUT
 
