@@ -9,8 +9,7 @@ import torch
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from paper.bic import bic_curve
-from paper.cross_validation import CrossValidation, cross_validate
+from paper.selection import CrossValidation, bic_curve, cross_validate
 from torchgrasp import load_hand
 from torchgrasp.files import write_file
 from torchgrasp.posture_model.sample import sample_configurations
@@ -44,12 +43,8 @@ def fig6(out: Path, n: int = 40_000, apart: int = 20_000, folds: int = 10, seed:
         samples = sample_configurations(hand, n, seed, sampling="grasping")
         others = sample_configurations(hand, apart, seed + 1, sampling="grasping")
         with tqdm(total=len(SWEEP) * (folds + 1), desc=name, disable=None, leave=False) as bar:
-            curve = bic_curve(
-                samples, SWEEP, observer=lambda m, mixture: bar.update() and None, **FIT
-            )
-            crossed = cross_validate(
-                others, SWEEP, folds, observer=lambda m, fold: bar.update() and None, **FIT
-            )
+            curve = bic_curve(samples, SWEEP, tick=bar.update, **FIT)
+            crossed = cross_validate(others, SWEEP, folds, tick=bar.update, **FIT)
         print(name, curve, crossed, f"the paper: {PUBLISHED[name]}", sep="\n")
         curves[name] = curve, crossed
     draw_selection(curves, out / "fig6.png")

@@ -1,4 +1,6 @@
-"""Cross-validation of the number of Gaussians (footnote 4 of the paper)."""
+"""How many Gaussians: the information criterion of separate fits, the reference of `growing_bic`,
+and cross-validation (Fig. 6 and footnote 4 of the paper).
+"""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -12,7 +14,25 @@ from torchgrasp import fit_mixture
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.posture_model import HandSamples
-from torchgrasp.posture_model.score import evaluate_mixture
+from torchgrasp.posture_model.score import BicCurve, evaluate_mixture
+
+
+def bic_curve(
+    samples: HandSamples,
+    components: Sequence[int],
+    *,
+    tick: Callable[[], object] = lambda: None,
+    **fit: Any,
+) -> BicCurve:
+    """Fit a mixture for each number of components, and return the BIC of each (Fig. 6 b, d).
+
+    `tick` is called after each fit, `fit` holds more arguments of `fit_mixture`.
+    """
+    criterion = []
+    for m in components:
+        criterion.append(float(fit_mixture(samples, m, **fit).meta["bic"]))
+        tick()
+    return BicCurve(torch.tensor(list(components)), torch.tensor(criterion, dtype=torch.float64))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,41 +63,25 @@ def cross_validate(
     folds: int = 10,
     seed: int = 0,
     *,
-    observer: Callable[[int, int], None] = lambda m, fold: None,
+    tick: Callable[[], object] = lambda: None,
     **fit: Any,
 ) -> CrossValidation:
-    """Fit on all folds but one and evaluate on that one, for each number of components (footnote 4
-    of the paper).
+    """Fit on all folds but one and evaluate on that one, for each number of components.
 
-    Args:
-        samples: postures to divide.
-        components: numbers to try.
-        folds: number of parts.
-        seed: of the division and of the starts.
-        observer: called after each fit with its number of components and its fold.
-        fit: iterations, tolerance and regularisation of `fit_mixture`.
-
-    Raises:
-        BadArgument: no number to try, folds outside [2, half the samples], or what `fit_mixture`
-            refuses.
-        IndefiniteCovariance: as `fit_mixture`.
+    The `seed` divides the samples and starts the fits. `tick` and `fit` are as in `bic_curve`.
+    Raises `BadArgument` for `folds` outside [2, half the samples].
     """
-    if not components:
-        raise BadArgument("components", "none", "at least one number")
     if not 2 <= folds <= len(samples) // 2:
         raise BadArgument("folds", folds, f"2 to {len(samples) // 2}")
-    order = torch.randperm(len(samples), generator=torch.Generator().manual_seed(seed)).to(
-        samples.q.device
-    )
+    order = torch.randperm(len(samples), generator=torch.Generator().manual_seed(seed))
     parts = order.tensor_split(folds)
     error, log_likelihood = torch.empty(2, len(components), folds, dtype=torch.float64)
     for k, m in enumerate(components):
         for fold, held_out in enumerate(parts):
             rest = torch.cat([part for part in parts if part is not held_out])
-            score = evaluate_mixture(
-                fit_mixture(samples[rest], m, seed=seed, **fit), samples[held_out]
-            )
+            mixture = fit_mixture(samples[rest], m, seed=seed, **fit)
+            score = evaluate_mixture(mixture, samples[held_out])
             error[k, fold] = score.mean_error
             log_likelihood[k, fold] = score.log_likelihood
-            observer(m, fold)
+            tick()
     return CrossValidation(torch.tensor(list(components)), log_likelihood, error)
