@@ -1,5 +1,6 @@
 """Shapes of partial clouds whose true surface is known in closed form."""
 
+import dataclasses
 import math
 from typing import Any, Literal
 
@@ -8,8 +9,14 @@ import torch
 from torch import Tensor
 
 from tests.make import ball, cup_view, near, real
-from torchgrasp import PointCloud, ShapeGP, fit_shape
-from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance, SuspiciousScale
+from torchgrasp import PointCloud, ShapeGP, fit_shape, load_object, plan_grasps
+from torchgrasp.cloud.prepare import estimate_normals
+from torchgrasp.foundation.errors import (
+    BadArgument,
+    IndefiniteCovariance,
+    NoEffect,
+    SuspiciousScale,
+)
 from torchgrasp.shape.conditioning import Criterion
 from torchgrasp.shape.extra_observations import STD_FACTORS
 from torchgrasp.shape.kernel import Kernel, KernelName, matern52_kernel
@@ -125,6 +132,7 @@ def test_a_whole_surface_needs_no_completion_and_a_viewpoint_does_not_turn_it(
     viewpoint: Tensor | None,
 ):
     whole = ball(900, viewpoint=viewpoint)
+    assert whole.normals is not None
     shape = fit_shape(whole)
     found = shape.predict(whole.points)
     assert len(shape.x) == 85
@@ -245,3 +253,47 @@ def test_the_default_device_and_dtype_change_no_shape(cloud: PointCloud, shape: 
         near(a.weights, b.weights, 1e-9 * float(b.weights.abs().max()))
     near(drawn, shape.sample(points, 2), 1e-6)
     assert slopes.normal.dtype == points.dtype and slopes.normal.device.type == "cpu"
+
+
+def opposite(view: PointCloud) -> PointCloud:
+    """Return a view with the camera on the far side of the object, as high as the true one."""
+    assert view.viewpoint is not None
+    across = 2.0 * (view.points.mean(0) - view.viewpoint)
+    return PointCloud(view.points, None, view.viewpoint + across * real([1.0, 1.0, 0.0]))
+
+
+@pytest.mark.parametrize("name", ["cylinder", "jug", "rabbit"])
+@pytest.mark.parametrize("support", ["camera", "paper"])
+def test_a_camera_that_the_points_contradict_is_refused_and_the_true_one_is_not(
+    name: str, support: Literal["camera", "paper"]
+):
+    view = load_object(name).view
+    assert fit_shape(view, support=support).cloud.viewpoint is not None
+    with pytest.raises(BadArgument, match=r"viewpoint: .* points contradict"):
+        fit_shape(opposite(view), support=support)
+
+
+def test_plans_refuse_such_a_camera_and_one_cloud_of_several_alone():
+    view = load_object("jug").view
+    with pytest.raises(BadArgument, match=r"viewpoint: .* points contradict"):
+        plan_grasps(opposite(view), "barrett", starts=8)
+    right, wrong = plan_grasps([view, opposite(view)], "barrett", starts=8)
+    assert len(right) and not len(wrong) and "viewpoint" in wrong.meta["refused"]
+
+
+@pytest.mark.parametrize("support", ["camera", "paper"])
+def test_inward_normals_of_a_view_are_refused(support: Literal["camera", "paper"]):
+    view = estimate_normals(load_object("jug").view)
+    assert view.normals is not None
+    fit_shape(view, support=support)
+    with pytest.raises(BadArgument, match=r"normals: .* away from the camera"):
+        fit_shape(dataclasses.replace(view, normals=-view.normals), support=support)
+
+
+def test_a_camera_beside_what_the_normals_of_a_view_show_is_told():
+    view = estimate_normals(load_object("jug").view)
+    assert view.viewpoint is not None
+    across = torch.linalg.cross(view.viewpoint, real([0.0, 0.0, 1.0]))
+    beside = dataclasses.replace(view, viewpoint=2.0 * across)
+    with pytest.warns(NoEffect, match="viewpoint changes nothing: .* of the normals face it"):
+        fit_shape(beside)

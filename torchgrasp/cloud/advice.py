@@ -109,6 +109,18 @@ def judge_view(
     return sorted(advice, key=lambda one: not one.refused)
 
 
+def check_camera(clean: PointCloud) -> None:
+    """Raise `BadArgument` if the given camera of a view cannot have seen the view's points.
+
+    `clean` is a cloud without outliers, with normals of either sign. A cloud without viewpoint
+    raises nothing.
+    """
+    found = _contradict(clean)
+    if found is not None:
+        found = f"one that the points contradict: a camera there {found}"
+        raise BadArgument("viewpoint", found, "the camera's true position, or None to estimate it")
+
+
 def _judge_facing(facing: float) -> Advice | None:
     """Return advice if too few normals face the camera: nearly all do in a single view, half on a
     whole surface.
@@ -151,6 +163,22 @@ def _judge_camera(clean: PointCloud, given: bool) -> Advice | None:
     """Return advice if a camera, `given` by the user or else estimated, cannot have seen the points
     of its view.
     """
+    what = _contradict(clean)
+    if what is None:
+        return None
+    found = f"an estimated camera that the points contradict: it {what}"
+    fix = "a single view with its --viewpoint X Y Z, or outward normals"
+    if given:
+        found = f"a viewpoint that the points contradict: a camera there {what}"
+        fix = "the true camera, --viewpoint X Y Z, or an estimate, --no-viewpoint"
+    return Advice(found, fix, given)
+
+
+def _contradict(clean: PointCloud) -> str | None:
+    """Return what a camera would see of the view that contradicts it most; None if nothing does.
+
+    Views of fewer than 50 points (`ADVICE.fewest`) contradict nothing. `clean` has normals.
+    """
     worst = (0.0, 0.0)
     for view in clean.split_views():
         eye = view.viewpoint
@@ -160,15 +188,9 @@ def _judge_camera(clean: PointCloud, given: bool) -> Advice | None:
     edge_on, behind = UNSEEN.excess(worst)
     if max(edge_on, behind) <= 1:
         return None
-    what = f"has {worst[1]:.0%} of them behind others"
     if edge_on > behind:
-        what = f"sees {worst[0]:.0%} of them edge-on"
-    found = f"an estimated camera that the points contradict: it {what}"
-    fix = "a single view with its --viewpoint X Y Z, or outward normals"
-    if given:
-        found = f"a viewpoint that the points contradict: a camera there {what}"
-        fix = "the true camera, --viewpoint X Y Z, or an estimate, --no-viewpoint"
-    return Advice(found, fix, given)
+        return f"sees {worst[0]:.0%} of them edge-on"
+    return f"has {worst[1]:.0%} of them behind others"
 
 
 def _judge_table(cloud: PointCloud, table: Plane) -> Advice | None:

@@ -17,7 +17,8 @@ from torchgrasp.cloud.registration import align_views, compare_views
 from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, NoEffect, TooFewPoints
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import Points, Vector, unit, unit_of_any
 from torchgrasp.values.planning import PointCloud
@@ -117,10 +118,11 @@ def prepare_cloud(
     random signs, with which a single view would look like a whole surface. With `clean`, outliers
     are removed, the other points are moved onto quadrics fitted around them, and all normals are
     fitted anew. Also with `clean`, a viewpoint that too few given normals face counts as missing.
+    If these are the normals of one side, `NoEffect` warns of it.
     With `clean`, a missing viewpoint is that of `find_pixel_camera`, if its pixels show it; `up` is
     the upward direction, or None. Else, and where normals are fitted, it is estimated by
     `guess_viewpoint`. Raises the errors of `check_cloud`, `BadArgument` for more than 16
-    cameras, and `TooFewPoints` for a view of fewer than 10 points.
+    cameras or normals that point away from the camera, and `TooFewPoints` for a view of fewer than 10 points.
     """
     cloud = remove_duplicates(cloud)
     normals = cloud.normals
@@ -136,9 +138,14 @@ def prepare_cloud(
     if normals is not None:
         if not compare_normals(cloud.points.double(), normals.double()).oriented:
             normals = None
-        elif clean and viewpoint is not None:
+        elif viewpoint is not None:
             facing = share_facing(cloud.points, normals, viewpoint)
-            viewpoint = viewpoint if facing >= FACING else None
+            if facing < 1 - FACING:
+                found = f"{1 - facing:.0%} of them pointing away from the camera"
+                raise BadArgument("normals", found, "outward normals, or None to fit them")
+            if clean and facing < FACING:
+                viewpoint = None
+                _warn_of_one_side(normals, facing)
     estimated = viewpoint is None
     if clean and estimated:
         # before points are moved: the fit of normals smooths the lattice away
@@ -159,6 +166,19 @@ def prepare_cloud(
     normals = unit(precise.normals)
     fields = precise.viewpoint, precise.frustum, precise.pose_error
     return PreparedCloud(cloud, precise.points, normals, *fields, estimated)
+
+
+def _warn_of_one_side(normals: Points, facing: float) -> None:
+    """Warn of a viewpoint that counts as missing, if the `normals` (n, 3) are those of one view.
+
+    Those of a whole surface point in all directions, so that no warning is due. `facing` is the
+    share of normals that face the viewpoint.
+    """
+    directions = unit_of_any(normals.double())
+    if float((directions @ directions.sum(0) > 0).double().mean()) >= FACING:
+        found = f"{facing:.0%} of the normals face it, so that the view counts as a whole surface"
+        fix = "expected the true camera of the view, or None"
+        warn_user(NoEffect, f"viewpoint changes nothing: {found}; {fix}")
 
 
 def _seen_by_pixels(points: Points, normals: Points | None, up: Vector | None) -> Vector | None:

@@ -147,10 +147,10 @@ def plan_grasps(
 
     Raises:
         BadArgument: an argument of the wrong type or range; an object that is not of graspable
-            size; a table above most points or a camera, or more than 2 m below the object's top; a
-            scene without a target; `keep` off the object; an `arm` that carries another hand; a
-            `promise` for a displaced object; `shape`, `observer`, `reachable`, `arm` or a region
-            beside several clouds. `CloudFileError` and `HandFileError` are kinds of it.
+            size; a camera that cannot have seen the points; a table above most points or a camera,
+            or more than 2 m below the object's top; a scene without a target; `keep` off the
+            object; an `arm` of another hand; a `promise` for a displaced object; `shape`, `arm`,
+            `observer`, `reachable` or a region beside several clouds; a bad file of cloud or hand.
         MissingExtra, NoWorkers: pebble is not installed, or no worker process can start.
 
     If cloud, camera and table are moved together, the grasps move with them. In a scene the hand

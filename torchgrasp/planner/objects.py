@@ -115,7 +115,8 @@ class ShapedObject:
         if shape is None:
             options = FitOptions(support="paper" if request.mode == "paper" else "camera")
             floor = None if spec.table is None else 0.0
-            shape = fit_upright(round_upright(cloud, frame), request.seed, floor, options)
+            upright = round_upright(cloud, frame)
+            shape = fit_upright(upright, request.seed, floor, options, in_image=scene is not None)
         else:
             shape = shape.moved(inverse(frame))
         surface = extract_mesh(shape)

@@ -6,11 +6,12 @@ from typing import Annotated, Literal
 
 import torch
 
+from torchgrasp.cloud.advice import check_camera
 from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
-from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
+from torchgrasp.cloud.prepare import PreparedCloud, clean_cloud, prepare_cloud
 from torchgrasp.data.accept import CloudLike, as_cloud
 from torchgrasp.foundation.base import join
 from torchgrasp.foundation.checks import checked
@@ -122,8 +123,9 @@ def fit_shape(
     Raises:
         BadArgument: an argument out of range; a table above the object's foot or a camera, or more
             than 2 m below the object's top.
-        BadArgument: a cloud that `check_cloud` refuses; more than 16 cameras; a view that is not
-            wholly in front of its camera; for "camera" a whole surface without normals.
+        BadArgument: a cloud that `check_cloud` refuses; more than 16 cameras; a camera that cannot
+            have seen its points, or that the normals point away from; for "camera" a whole surface
+            without normals.
         BadArgument: a kernel whose profile requires a gradient (use `condition`).
         TooFewPoints: fewer than 4 distinct points, or fewer than 10 of one of several views.
         SuspiciousScale: an extent outside [5 mm, 2 m].
@@ -166,11 +168,13 @@ def fit_upright(
     seed: int,
     table: float | None,
     options: FitOptions,
+    in_image: bool = False,
 ) -> ShapeGP:
     """Return the shape fitted to a cloud [m] without duplicates in a frame whose z axis points up.
 
     `table` is the table's height [m]; None means no table. `seed` is the random seed, and `options`
-    are those of `fit_shape`.
+    are those of `fit_shape`. `in_image` says that the points are pixels of a depth image, so that
+    they need not be compared with their camera.
     """
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))
@@ -187,17 +191,25 @@ def fit_upright(
     noise = options.noise
     up = None if table is None else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32, device="cpu")
     seen = prepare_cloud(cloud, generator, clean=options.support == "camera", up=up)
+    # the camera of a depth image is known, an estimated one is a guess, a whole surface has none
+    judged = seen.one_sided and not in_image and not seen.estimated
+    view = PointCloud(seen.points, seen.normals, seen.viewpoint, seen.frustum)
     if options.support == "paper":
+        if judged:
+            check_camera(clean_cloud(view))
         return _fit_surface(seen, paper_support(seen, noise, generator), options)
     if not seen.one_sided:
         return _fit_surface(seen, camera_support(seen, None, noise, table), options)
-    view = PointCloud(seen.points, seen.normals, seen.viewpoint, seen.frustum)
     vessel = None if table is None else find_vessel(seen.points.cpu(), seen.normals.cpu())
     if vessel is None or table is None:
         completion = complete_cloud(view, table)
+        if judged:
+            check_camera(view)
         _warn_of_ambiguity(view, completion.outline, table is not None)
         return _fit_surface(seen, camera_support(seen, completion, noise, table), options)
     outline = silhouettes(view.to("cpu"))
+    if judged:
+        check_camera(view)
     _warn_of_ambiguity(view, outline, on_table=True)
     *supports, middle = vessel_supports(view, vessel, outline, table, noise)
     outer, inner = (_fit_surface(seen, support, options) for support in supports)

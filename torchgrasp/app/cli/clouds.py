@@ -246,7 +246,7 @@ class ShapeSurface(Command):
         check_surface_path(self.out)
         file = self.view.read("CLOUD", find_view(self.cloud, "CLOUD"))
         table = self.view.with_table_of(file).plane(file.cloud)
-        with naming(table="--table"):
+        with naming(table="--table", viewpoint="--viewpoint", normals="CLOUD"):
             shape = fit_shape(file.cloud, support=self.support, seed=self.seed, table=table)
         estimate = extract_surface(shape, self.resolution)
         save_surface(estimate, self.out)
