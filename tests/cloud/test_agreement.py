@@ -6,17 +6,18 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp import load_object
+from torchgrasp import fit_shape, load_object
 from torchgrasp.cloud.agreement import (
     check_agreement,
     check_contacts,
     check_foot,
     check_mesh,
     check_stand,
+    warn_of_low_table,
 )
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
 
@@ -118,3 +119,30 @@ def test_a_mesh_that_is_not_where_the_grasp_is_is_told(way, hand):
         return check_contacts(grasp, misplaced(way))
     with pytest.raises(BadArgument, match=r"mesh: .*(within 10 mm of the mesh|foot is \d+ mm)"):
         check_contacts(grasp, misplaced(way))
+
+
+def test_a_table_is_told_that_is_farther_below_the_points_than_they_extend():
+    """A ball seen from straight above shows no foot, and its table is right."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05).apply_translation((0, 0, 0.05))
+    for cloud in (view(), partial_view(ball, look_at(0.0, 89.0, 0.6, ball), 400)):
+        foot = float(cloud.points[:, 2].quantile(0.02))
+        extent = float((cloud.points.amax(0) - cloud.points.amin(0)).norm())
+        for height in (0.0, foot - 0.99 * extent):
+            warn_of_low_table(cloud, Plane.horizontal(height))
+        with pytest.warns(
+            NoEffect, match=r"table changes nothing: it is \d+ mm below .*--no-table"
+        ):
+            warn_of_low_table(cloud, Plane.horizontal(foot - 1.01 * extent))
+
+
+def test_such_a_table_is_told_once_and_the_shape_is_that_of_any_table_as_low():
+    """Which is what the warning says: the table changes nothing."""
+    shapes = []
+    for height in (-0.6, -0.9):
+        with pytest.warns(NoEffect, match="table changes nothing") as told:
+            shapes.append(fit_shape(view(), table=height))
+        assert len(told) == 1
+    at = view().points
+    first, second = (shape.predict(at) for shape in shapes)
+    torch.testing.assert_close(first.distance, second.distance, rtol=0.0, atol=1e-4)
+    torch.testing.assert_close(first.std_m, second.std_m, rtol=0.0, atol=1e-5)  # [m]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import torch
 
 from torchgrasp.cloud.advice import check_camera
-from torchgrasp.cloud.agreement import check_foot
+from torchgrasp.cloud.agreement import check_foot, warn_of_low_table
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
@@ -113,7 +113,8 @@ def fit_shape(
         support: "camera" or "paper", as above.
         seed: seed of the random draws.
         table: the table's plane, or its height [m] along z; None means no table. Only "camera"
-            keeps the shape out of it.
+            keeps the shape out of it. One farther below the points than they extend changes
+            nothing, of which `NoEffect` warns.
         kernel: "thin_plate", "matern52" or "rbf", whose length follows from psi; or your own
             `Kernel` of normalised distances.
         criterion: the most informative point has the greatest "variance" of its distance, the
@@ -178,6 +179,8 @@ def fit_upright(
     """
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))
+        if not in_image:  # in a scene, others may hide the foot
+            warn_of_low_table(cloud, Plane.horizontal(table))
     if len(cloud) < FEW_POINTS:
         few = f"{len(cloud)} points, where a shape needs {FEW_POINTS}"
         warn_user(FewPoints, f"{few}: the shape is a guess; give more points")
