@@ -29,7 +29,7 @@ from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.foundation.rules import Range
 from torchgrasp.hand.hand import Hand
 
-# limits of the wall time [s] of planning on a view and of an attempt
+# limits of the CPU time [s] of planning on a view and of an attempt; see `run_tasks`
 PLAN_LIMIT = 900.0
 TRIAL_LIMIT = 120.0
 
@@ -60,7 +60,9 @@ def evaluate(
             OBJECT/VIEW.safetensors. None means a temporary folder. No other run may write to it at
             the same time.
         workers: number of worker processes. 0 means this process, without time limits. Apart from
-            CPU times and tasks that are ended at a limit, the scores do not depend on it.
+            CPU times and tasks that are ended at a limit, the scores do not depend on it. Such
+            tasks have the status `TIMED_OUT`, which `summarise` counts. The limit is of CPU time,
+            on which the load of the machine has little influence, but its speed has.
 
     Raises:
         BadArgument: the protocol is unknown.

@@ -6,6 +6,7 @@ import math
 import multiprocessing
 import os
 import queue
+import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
@@ -25,6 +26,11 @@ Result = TypeVar("Result")
 Task = tuple[Any, ...]
 _starting = threading.Lock()
 
+WALL = 10.0
+"""Limit of a task's wall time on a busy machine, over that of its processor time."""
+LATE = -int(getattr(signal, "SIGPROF", 0))
+"""Exit code of a process that the timer of its processor time ended; 0 where there is none."""
+
 
 @checked
 def run_tasks(
@@ -36,8 +42,10 @@ def run_tasks(
     """Yield the results of `function(*task)` for all tasks, which run in worker processes, in the
     order of the tasks.
 
-    Each task runs on one thread of a separate process. A task that takes longer than `limit` [s]
-    gives `Status.TIMED_OUT`. A task whose process dies twice gives `Status.WORKER_DIED`. The error
+    Each task runs on one thread of a separate process. A task that takes more than `limit` [s] of
+    the process's CPU time gives `Status.TIMED_OUT`: on a busy machine it ends at the same point.
+    One that takes ten times as long by the clock gives it, too, since it may wait for ever; on
+    Windows only this applies. A task whose process dies twice gives `Status.WORKER_DIED`. The error
     of a task is raised in place of its result. All workers end when the caller stops iterating.
     Raises `NoWorkers` if no process can start.
 
@@ -56,8 +64,8 @@ def run_as_they_end(
     ends.
 
     The result is that of `function(*task)`, or a `Status` if the task took too long or its process
-    died (`run_tasks`). `workers` is the number of processes, and `limit` [s] the longest time of a
-    task.
+    died (`run_tasks`). `workers` is the number of processes, and `limit` [s] the longest CPU time of
+    a task.
     """
     with contextlib.closing(_run(function, tasks, workers, limit)) as results:
         for number, ended in results:
@@ -143,7 +151,8 @@ def _run_pool(
             while waiting and len(running) < 2 * workers:
                 number, task = waiting[0]
                 try:
-                    future = pool.schedule(function, task, timeout=limit)
+                    timed = (limit, function, *task)
+                    future = pool.schedule(_call_timed, timed, timeout=WALL * limit)
                 except RuntimeError:  # the pool broke
                     return
                 running[number] = waiting.popleft()[1], future
@@ -158,7 +167,10 @@ def _run_pool(
             if isinstance(error, BrokenProcessPool):
                 return
             task, future = running.pop(number)
-            if isinstance(error, ProcessExpired) and number not in died:
+            late = isinstance(error, ProcessExpired) and error.exitcode == LATE
+            if late or isinstance(error, TimeoutError):
+                yield number, Status.TIMED_OUT
+            elif isinstance(error, ProcessExpired) and number not in died:
                 died.add(
                     number
                 )  # a machine short of memory may kill any process: try once more, first
@@ -166,7 +178,7 @@ def _run_pool(
             elif isinstance(error, ProcessExpired):
                 yield number, Status.WORKER_DIED
             else:
-                yield number, Status.TIMED_OUT if isinstance(error, TimeoutError) else future
+                yield number, future
     finally:
         waiting.extendleft(
             (number, task) for number, (task, _) in sorted(running.items(), reverse=True)
@@ -231,6 +243,20 @@ def _begin(function: Callable[..., Any], environment: dict[str, str]) -> None:
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
+
+
+def _call_timed(limit: float, function: Callable[..., Result], *task: Any) -> Result:
+    """Call a function in a worker process, which ends if the call takes more than `limit` [s] of
+    CPU time.
+    """
+    timed = hasattr(signal, "setitimer") and math.isfinite(limit)
+    if timed:
+        signal.setitimer(signal.ITIMER_PROF, limit)
+    try:
+        return function(*task)
+    finally:
+        if timed:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
 
 
 class _Packed(NamedTuple):
