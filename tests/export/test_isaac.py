@@ -14,6 +14,7 @@ import torch
 import yaml
 import yourdfpy
 
+from tests.pinch import pinch
 from torchgrasp import Plane, load_grasps, load_hand
 from torchgrasp.app import cli
 from torchgrasp.data.shipped import load_shipped_grasp
@@ -299,3 +300,24 @@ def test_a_hand_that_goes_down_while_it_closes_is_left_out_and_told(tmp_path, ca
         assert "1 of 2 grasps are left out" in capsys.readouterr().out
     grasps = yaml.safe_load((tmp_path / "isaac.yaml").read_text())["grasps"]
     assert [x["position"][2] for x in grasps.values()] == [float(higher[0, 2, 3])]
+
+
+def test_a_file_of_another_hand_is_refused_by_its_name_and_one_without_is_told(tmp_path):
+    """The left hand has the joints and links of the right one, so that nothing else tells."""
+    path = tmp_path / "hands.yaml"
+    right, grasp = pinch("allegro")
+    left = load_hand("allegro_left")
+    text = format_isaac(right, grasp)
+    path.write_text(text)
+    read = read_foreign(path, right)
+    torch.testing.assert_close(read.joints, grasp.joints.double(), atol=1e-9, rtol=0.0)
+    with pytest.raises(ModelFileError, match=r"of the allegro_left hand, .* of the allegro hand"):
+        read_foreign(path, left)
+    unnamed = text[text.index("format:") :]
+    path.write_text(unnamed)
+    for hand in (right, left):
+        with pytest.warns(GraspFileWarning, match=rf"names no hand, .* of the {hand.name} hand"):
+            read_foreign(path, hand)
+    frame = yaml.safe_load(text)["gripper_frame_link"]
+    path.write_text(unnamed.replace(f"link: {frame}", f"link: /World/allegro/{frame}"))
+    assert torch.equal(read_foreign(path, right).joints, read.joints)

@@ -102,6 +102,7 @@ def read_foreign(
 
     Coupled and parked joints of the file may differ from the hand's, unless a fingertip moves by
     over 0.1 mm. A `GraspFileWarning` names values that are not kept, and joints that bend backward.
+    It tells, too, if an `isaac_grasp` file names no hand in its first line or the gripper's path.
 
     Args:
         path: the file. Its angles are in radians.

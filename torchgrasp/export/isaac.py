@@ -46,6 +46,8 @@ FLANGE = "flange"
 POSE_KEYS = "confidence", "position", "orientation"
 ALLOWED = f"an {FORMAT} file of version {VERSION}"
 DEEPEST = 8  # most levels of a file; the format has five
+OWN = "# grasps of the {} hand, by torchgrasp"  # the first line of our files
+OWN_HAND = re.compile(OWN.format("(.+)"))
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")  # YAML 1.1 takes 1e-05 for a text
 
 
@@ -135,7 +137,7 @@ def format_isaac(
     frames = dict(zip(ROS_FRAMES if isaac_ros else FRAMES, (object_id, frame), strict=True))
     content = {"format": FORMAT, "format_version": VERSION, **frames, "grasps": rows}
     heading = (
-        f"# grasps of the {hand.name} hand, by torchgrasp: metres, radians; best first\n"
+        f"{OWN.format(hand.name)}: metres, radians; best first\n"
         f"# object's frame: that of the planned cloud; the hand's root link is {root!r} of "
         f"{hand.urdf_path.name}\n"
         f"# confidence is the predicted success, 0 where it is unknown; {SQUEEZE} has the\n"
@@ -172,11 +174,17 @@ def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -
     """Return the content of an `isaac_grasp` file of at most `most` grasps, with numbers up to
     `far`.
 
-    A `GraspFileWarning` names keys that are not read. Raises the error of `refuse` for a malformed
-    file, another version, a joint that the hand does not have, and an actuated joint that is
-    missing.
+    A `GraspFileWarning` names keys that are not read. It tells if neither the first line nor the
+    gripper's path names a hand: one of the other side may have the same joints. Raises the error of
+    `refuse` for a malformed file, another version, our own file of another hand, a joint that the
+    hand does not have, and an actuated joint that is missing.
     """
-    content = _read_yaml(path, refuse).entries("format", "format_version", "grasps")
+    data = read_bounded(path, JSON_BYTES, ALLOWED, refuse)
+    content = _read_yaml(path, data, refuse).entries("format", "format_version", "grasps")
+    named = OWN_HAND.match(data.decode("utf-8"))
+    if named is not None and named[1] != hand.name:
+        allowed = f"grasps of the {hand.name} hand, which is to read them"
+        raise refuse(f"{path}: grasps of the {named[1]} hand", allowed)
     for key, wanted in (("format", FORMAT), ("format_version", VERSION)):
         if content[key].value != wanted:
             raise content[key].wrong(str(wanted))
@@ -207,6 +215,13 @@ def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -
         skipped |= {*fields} - {*POSE_KEYS, *keys.values(), SQUEEZE}
     if skipped:
         warn_user(GraspFileWarning, f"{path.name}: not read: {', '.join(sorted(skipped))}")
+    # Isaac's frame of the gripper may be a path in the stage, with the hand's name
+    if named is None and hand.name not in "".join(frames[:1]).split("/"):
+        warn_user(
+            GraspFileWarning,
+            f"{path.name}: it names no hand, so that its joints alone tell that it is of the "
+            f"{hand.name} hand; one of the other side may have the same",
+        )
     postures = {what: _fill(hand, fields, far) for what, fields in taken.items()}
     numbers = np.array(poses, dtype=float).reshape(-1, 7)
     return IsaacFile("".join(frames[:1]), numbers, postures)
@@ -234,13 +249,12 @@ def _fill(hand: Hand, rows: list[dict[str, Field]], far: float) -> dict[str, np.
     return values
 
 
-def _read_yaml(path: Path, refuse: Refuse) -> Field:
-    """Return the content of a YAML file as a field: objects, lists, texts, and numbers.
+def _read_yaml(path: Path, data: bytes, refuse: Refuse) -> Field:
+    """Return the content `data` of a YAML file as a field: objects, lists, texts, and numbers.
 
     Text that is a number is one, in quotes, too, as Isaac Sim reads it. Keys are texts. Raises the
     error of `refuse` for malformed YAML, and for aliases, equal keys or a deep nesting.
     """
-    data = read_bounded(path, JSON_BYTES, ALLOWED, refuse)
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     try:
         # events alone: the loaders themselves recurse, and expand aliases
