@@ -37,6 +37,20 @@ def test_check_cloud_names_a_wrong_unit(factor, words):
         check_cloud(PointCloud(cloud() * factor))
 
 
+@pytest.mark.parametrize("unit", [100.0, 1000.0])
+def test_check_cloud_refuses_a_camera_in_another_unit_than_the_points(unit):
+    """Its noise would grow with the squared distance, and hide a table above the foot."""
+    for name in list_objects():
+        view = load_object(name).view
+        assert view.viewpoint is not None
+        check_cloud(view)
+        each = (unit * view.viewpoint).expand(len(view), 3).clone()
+        for viewpoint in (unit * view.viewpoint, each):
+            with pytest.raises(BadArgument, match=r"viewpoint: .* within 50 m .* in metres"):
+                check_cloud(PointCloud(view.points, None, viewpoint))
+    check_cloud(PointCloud(cloud(), None, real([0.0, 0.0, 49.0])))
+
+
 def test_check_cloud_finds_few_distinct_points_among_many_copies():
     points = cloud(2).repeat(30_000, 1)
     with pytest.raises(TooFewPoints, match="2 distinct"):

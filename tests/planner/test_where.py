@@ -71,6 +71,8 @@ def test_what_is_no_distance_is_told_by_the_name_of_its_argument():
         ("keep", lambda x: x),
         ("avoid", lambda x: 3.0),
         ("keep", Region(lambda x: x[:, 0] / 0)),
+        ("keep", lambda x: x[:, 2] > 0.1),
+        ("avoid", lambda x: x[:, 2].long()),
     ):
         with pytest.raises(BadArgument, match=f"^{name}: .*one finite number each"):
             plan_grasps(VIEW, HAND, starts=4, **{name: wrong})

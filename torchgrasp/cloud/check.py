@@ -40,6 +40,8 @@ class CloudNumbers:
     """Greatest extent, read as metres, that is taken for cm, of an object of at most 45 cm; a
     larger one is taken for mm.
     """
+    farthest: float = 50.0
+    """Greatest distance [m] of a camera; depth images measure no farther, and one in cm is."""
 
 
 CLOUD = CloudNumbers()
@@ -55,7 +57,8 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
         TooFewPoints: fewer than 4 distinct points.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m], as of points
             in mm.
-        BadArgument: points that all coincide or lie on one line; a normal of length zero.
+        BadArgument: points that all coincide or lie on one line; a normal of length zero; a camera
+            more than 50 m (`CLOUD.farthest`) away, as one in mm.
 
     >>> check_cloud(PointCloud(torch.rand(50, 3))).viewpoint is None
     True
@@ -138,8 +141,8 @@ def _check_distinct(points: Points, rows: Int[Tensor, "m"]) -> None:
 
 
 def _check(cloud: PointCloud) -> Points:
-    """Return the cloud's points, or raise an error if its extent is implausible or a normal has
-    length zero.
+    """Return the cloud's points, or raise an error if its extent or camera is implausible, or a
+    normal has length zero.
     """
     points = cloud.points
     extent = float((points.amax(0) - points.amin(0)).max())
@@ -155,6 +158,11 @@ def _check(cloud: PointCloud) -> Points:
         if zero:
             found = f"{zero} normals of length zero"
             raise BadArgument("normals", found, "normals with a direction")
+    if cloud.viewpoint is not None:
+        away = float(torch.linalg.vector_norm(cloud.viewpoint - points, dim=-1).max())
+        if away > CLOUD.farthest:
+            allowed = f"a camera within {CLOUD.farthest:g} m of the points, in metres as they are"
+            raise BadArgument("viewpoint", f"one {away:.4g} m away", allowed)
     return points
 
 

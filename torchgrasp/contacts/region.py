@@ -62,19 +62,20 @@ class Region(Value):
     def __call__(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance (*b,) [m] of points (*b, 3) [m], negative inside the region.
 
-        Raises `BadArgument` if the function does not return one finite number for each point.
+        Raises `BadArgument` if the function does not return one finite float for each point.
         """
         flat = points.detach().double().reshape(-1, 3)
         found = self.distance(flat)
         if not (
             isinstance(found, Tensor)
+            and found.is_floating_point()  # a mask of the points inside is no distance
             and found.shape == flat.shape[:1]
             and bool(torch.isfinite(found).all())
         ):
             raise BadArgument(
                 self.name,
                 f"{show(found)} for {len(flat)} points",
-                "a tensor of one finite number each",
+                "a tensor of one finite number each, a float: its signed distance [m]",
             )
         return found.to(points).reshape(points.shape[:-1])
 
