@@ -2,6 +2,7 @@
 URDF.
 """
 
+import re
 import shutil
 
 import pytest
@@ -108,6 +109,19 @@ def test_links_that_no_check_could_see_are_refused(toy_hand, link, match):
     start = text.index(f'<link name="{link}">')
     (toy_hand / "hand.urdf").write_text(text[:start] + text[start:].replace(ball, "", 1))
     with pytest.raises(HandFileError, match=match):
+        load_hand(toy_hand)
+
+
+@pytest.mark.parametrize("grams", [60, 400])
+def test_masses_in_grams_are_refused(toy_hand, grams):
+    urdf = toy_hand / "hand.urdf"
+    text = urdf.read_text()
+    kilograms = re.sub(r'mass value="[^"]*"', f'mass value="{grams / 1000}"', text)
+    assert kilograms != text
+    urdf.write_text(kilograms)
+    load_hand(toy_hand)
+    urdf.write_text(kilograms.replace(f'"{grams / 1000}"', f'"{grams}"'))
+    with pytest.raises(HandFileError, match=rf"masses in kg.*in grams.*of {grams} kg"):
         load_hand(toy_hand)
 
 

@@ -45,6 +45,7 @@ XML_LETTERS = 200
 in a name.
 """
 HAND_LINKS = 512
+HAND_LINK_MASS = 50.0  # [kg]; palms weigh 0.1 to 1 kg, so that more is most likely in grams
 HAND_SHAPES = 1000
 HAND_SHAPE_PAIRS = 20_000
 """Largest numbers of links, of collision shapes, and of shape pairs tested for self-collision in a

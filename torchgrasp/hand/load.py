@@ -5,6 +5,7 @@ from pathlib import Path
 
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, HandFileError
+from torchgrasp.foundation.limits import HAND_LINK_MASS
 from torchgrasp.geometry.frames import real
 from torchgrasp.hand.collision_shapes import self_collision_from_urdf, spheres_from_urdf
 from torchgrasp.hand.fingers import joints_from_files, tips_from_files
@@ -89,6 +90,7 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     urdf = read_urdf(spec.urdf)
     _check_names(spec, urdf)
     _check_mimics_and_shapes(spec, urdf)
+    _check_masses(urdf)
     chain = chain_from_urdf(urdf)
     digest = hashlib.sha256(spec.data + b"\0" + urdf.data).hexdigest()
     return Hand(
@@ -187,6 +189,14 @@ def _check_names(spec: HandSpec, urdf: Urdf) -> None:
             f"parked joint {min(both)!r}",
             "parked joints that neither grasp nor follow another joint",
         )
+
+
+def _check_masses(urdf: Urdf) -> None:
+    """Raise `HandFileError` for a link that is too heavy for a hand, as one in grams."""
+    for link in urdf.links:
+        if not link.mass <= HAND_LINK_MASS:
+            found = f"link {link.name} of {link.mass:g} kg"
+            raise urdf.wrong(found, f"masses in kg, at most {HAND_LINK_MASS:g} (in grams?)")
 
 
 def _check_mimics_and_shapes(spec: HandSpec, urdf: Urdf) -> None:
