@@ -7,7 +7,7 @@ import torch
 
 from tests.make import load_hand, near, see
 from torchgrasp import ContactSpec, Status, load_scene, plan_grasps, plan_scene
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.planner.graspable import order_by_ease
@@ -106,3 +106,10 @@ def test_targets_are_thinned_by_the_seed_and_wrong_arguments_are_named():
         plan_scene(dataclasses.replace(scene, labels=torch.zeros_like(scene.labels)), HAND)
     with pytest.raises(BadArgument, match="enough"):
         plan_scene(scene, HAND, enough=1.5)
+
+
+def test_a_low_table_that_takes_the_place_of_the_scenes_is_told(crowded):
+    scene, _ = crowded
+    with pytest.warns(NoEffect, match="table changes nothing: it is .* below"):
+        plan_grasps(scene, HAND, ContactSpec(table=-0.6), starts=4)
+    plan_grasps(scene, HAND, ContactSpec(table=scene.table), starts=4)

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.arm.reach import reach_poses, with_arm
-from torchgrasp.cloud.agreement import check_shape
+from torchgrasp.cloud.agreement import check_shape, warn_of_low_table
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
@@ -105,6 +105,8 @@ class ShapedObject:
         if isinstance(cloud, Scene):
             scene = cloud
             cloud = take_target(scene, request.seed)
+            if spec.plane is not None:  # it takes the place of the scene's own
+                warn_of_low_table(cloud, spec.plane)
             spec = dataclasses.replace(
                 spec, table=scene.table if spec.table is None else spec.table
             )
