@@ -13,6 +13,8 @@ from torchgrasp import Grasps, PointCloud, ShapeGP, Status, fit_shape, merge_clo
 from torchgrasp.cloud import look_at, partial_view
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
+from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.shape import extract_surface, next_view
 from torchgrasp.shape.completion.silhouette import pick_apart
@@ -116,6 +118,34 @@ def test_the_chosen_camera_is_above_the_table_and_looks_at_the_object(shape, cho
     assert next_view(shape, table=0.0, distance=0.3).turn > 60
     before, after = 1e3 * chosen.before, 1e3 * chosen.after
     assert chosen.sentence.endswith(f"std_m falls from {before:.1f} to {after:.1f} mm")
+
+
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 0.2), (0.0, 0.0, -2.1), (0.4, 1.0, 2.5)])
+def test_the_view_turns_with_the_cloud_and_the_table(first, chosen, axis):
+    shift = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+    motion = rigid(rotation_from_vector(torch.tensor(axis, dtype=torch.float64)), shift)
+    table = Plane.horizontal(0.0).moved(motion)
+    view = next_view(fit_shape(move(first, motion), table=table), table=table)
+    close = {"rtol": 1e-6, "atol": 1e-5}
+    torch.testing.assert_close(view.camera_pose, motion @ chosen.camera_pose, **close)
+    found = torch.tensor([view.turn, view.before, view.after])
+    told = torch.tensor([chosen.turn, chosen.before, chosen.after])
+    torch.testing.assert_close(found, told, **close)
+
+
+def test_the_view_of_contacts_turns_with_them(shape):
+    grasp = load_shipped_grasp("jug", "barrett")
+    flank = torch.tensor([[0.0, -0.03, 0.03], [0.02, -0.03, 0.02], [-0.02, -0.03, 0.05]]).double()
+    angle, shift = torch.tensor([[0.0, 0.0, 2.0], [0.1, -0.2, 0.0]]).double()
+    motion = rigid(rotation_from_vector(angle), shift)
+
+    def look(points: Tensor, seen: ShapeGP) -> Tensor:
+        contacts = dataclasses.replace(grasp.contacts, points=points[None])
+        found = dataclasses.replace(grasp, contacts=contacts)
+        return next_view(seen, found, table=0.0).camera_pose
+
+    turned = look(apply(motion, flank), shape.moved(motion))
+    torch.testing.assert_close(turned, motion @ look(flank, shape), rtol=0, atol=1e-5)
 
 
 def test_contacts_on_a_flank_are_looked_at_from_there(shape, chosen):

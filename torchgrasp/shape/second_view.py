@@ -13,6 +13,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Length, Measured, Pose
 from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane, as_plane, upright_frame
 from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
@@ -54,6 +55,8 @@ class SecondViewNumbers:
     """Deviation of a seen point, normalised: the noise that `fit_shape` assumes."""
     unseen: float = 1e3
     """Deviation, normalised, that stands for a point that was not seen."""
+    tie: float = 1e-6
+    """Share by which expected deviations of equal views may differ: far above rounding."""
 
 
 VIEW = SecondViewNumbers()
@@ -107,7 +110,8 @@ def next_view(
 ) -> NextView:
     """Return the camera for a second view that would reduce the shape's standard deviation most.
 
-    Candidates are cameras on a sphere around the object. A camera would see the points of the
+    Candidates are cameras on a sphere around the object, placed relative to the camera that took
+    the cloud: if cloud and table are turned, the answer turns with them. A camera would see the points of the
     estimated surface that face it and that no other part of the surface hides. The deviation after
     a view is that of the posterior given these points.
 
@@ -138,7 +142,10 @@ def next_view(
     plane = as_plane(table)
     if plane is None and grasps is not None:
         plane = grasps.table
-    targets, weights = _contacts(shape, grasps)
+    # the surface is sampled in the object's own frame: the view turns with it
+    frame = upright_frame(shape.cloud.points, shape.cloud.viewpoint, plane)
+    shape = shape.moved(inverse(frame))
+    targets, weights = _contacts(shape, grasps, frame)
     surface = extract_surface(shape, VIEW.resolution)
     # the surface may end a little outside the domain, where the posterior is unknown
     inside = torch.nonzero(shape.contains(surface.vertices))[:, 0]
@@ -149,16 +156,17 @@ def next_view(
         weights = torch.ones_like(points[:, 0])
     middle = find_middle(surface.vertices)
     away = _distance(shape, middle, distance)
-    poses = _poses(shape, plane, middle, away)
+    poses = _poses(middle, away, below=plane is None)
     field = field_from_surface(surface.vertices, surface.faces, VIEW.spacing, VIEW.margin)
     eyes = poses[:, :3, 3].to(points)
     seen = find_seen(points, surface.normals[rows], eyes, field)
     before, after = expect_deviation(shape, targets, points, seen)
     share = weights / weights.sum()
     expected = after @ share
-    best = int(expected.argmin())
+    # of views that tell the same, as to both sides of a round body, the first
+    best = int((expected <= (1 + VIEW.tie) * expected.min()).int().argmax())
     turn = _turn(shape, middle, eyes[best])
-    return NextView(poses[best], turn, float(before @ share), float(expected[best]))
+    return NextView(frame @ poses[best], turn, float(before @ share), float(expected[best]))
 
 
 def find_seen(
@@ -215,38 +223,39 @@ def expect_deviation(
 
 
 def _contacts(
-    shape: ShapeGP, grasps: Grasps | None
+    shape: ShapeGP, grasps: Grasps | None, frame: Pose
 ) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t"]]:
-    """Return the contacts [m] of the best executable grasps, and the weight of each."""
+    """Return the contacts [m] of the best executable grasps, and the weight of each.
+
+    The contacts are in the frame of the shape, which has the pose `frame` (4, 4) [m] in that of the
+    grasps.
+    """
     if grasps is None:
         return shape.x.new_zeros(0, 3), shape.x.new_zeros(0)
     good = grasps[grasps.status == Status.OK][: VIEW.grasps]
-    contacts = good.contacts.points.to(shape.x).flatten(0, 1)
+    points = good.contacts.points.to(shape.x)
+    contacts = apply(inverse(frame).to(points), points.flatten(0, 1))
     inside = shape.contains(contacts)
     if len(inside) and not bool(inside.any()):
         found = f"{len(inside)} contacts outside the shape's domain"
         raise BadArgument("grasps", found, "grasps of this shape, in its frame")
     # where the success is unknown, the score is still the best guess
     weights = torch.sigmoid(good.score).to(shape.x)
-    fingers = good.contacts.points.shape[1]
-    return contacts[inside], weights.repeat_interleave(fingers)[inside]
+    return contacts[inside], weights.repeat_interleave(points.shape[1])[inside]
 
 
-def _poses(
-    shape: ShapeGP, table: Plane | None, middle: Vector, distance: float
-) -> Float[Tensor, "v 4 4"]:
-    """Return the poses obj_from_camera [m] of the cameras that are compared, on the CPU."""
-    frame = upright_frame(shape.cloud.points, shape.cloud.viewpoint, table)
+def _poses(middle: Vector, distance: float, below: bool) -> Float[Tensor, "v 4 4"]:
+    """Return the poses [m] of the cameras that are compared, in the upright frame, on the CPU.
+
+    They look at the `middle` [m], and with `below` also from below.
+    """
     heights = VIEW.elevations
-    if table is None:
+    if below:
         heights = (*heights, 0.0, *(-height for height in heights))
     step = 360 / VIEW.azimuths
     around = [step * k for k in range(VIEW.azimuths)]
-    local = [look_at(azimuth, height, distance) for height in heights for azimuth in around]
-    poses = frame @ torch.stack(local)
-    # the cameras look at the middle, not at the origin of the frame
-    poses[:, :3, 3] += middle.cpu() - frame[:3, 3]
-    return poses
+    target = middle.cpu()
+    return torch.stack([look_at(a, height, distance, target) for height in heights for a in around])
 
 
 def _eyes(shape: ShapeGP) -> Float[Tensor, "c 3"]:
