@@ -6,12 +6,13 @@ import torch
 import trimesh
 
 from tests.make import HALF, box, halved
-from torchgrasp import Scene, read_scene, save_scene
+from torchgrasp import Scene, load_scene, plan_scene, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at
 from torchgrasp.cloud.camera import render_depth as render_whole
 from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.scene.creases import cut_creases
 from torchgrasp.values.planning import PointCloud
 
 POSE = look_at(20.0, 45.0, 0.6)
@@ -202,6 +203,36 @@ def test_an_object_that_hides_much_of_the_target_is_told(x, height, covers):
     told = [x for x in seen.select(1).advice if x.startswith("object 2 stands before")]
     assert len(told) == covers
     assert not any("stands before" in x for x in seen.advice)  # no target
+
+
+def test_doubts_of_all_targets_are_those_of_each_and_the_image_is_searched_once(monkeypatch):
+    scene = load_scene()
+    alone = [dataclasses.replace(scene, target=k) for k in scene.things]
+    expected = [(one.doubts, one.advice) for one in alone]
+    assert any(doubts for doubts, _ in expected)
+    calls = []
+
+    def count(image, points, labels):
+        calls.append(labels)
+        return cut_creases(image, points, labels)
+
+    monkeypatch.setattr("torchgrasp.scene.scene.cut_creases", count)
+    planned = []
+
+    def note(target, *_, **__):
+        planned.append((target.doubts, target.advice))
+        raise BadArgument("stop", "a scene", "none")
+
+    monkeypatch.setattr("torchgrasp.planner.scene_plan.plan_grasps", note)
+    plan_scene(scene, "barrett", starts=1)
+    assert len(planned) == len(expected) > 2 and all(found in expected for found in planned)
+    again = [scene.select(k).select(j).select(k) for k, j in zip((1, 2, 3), (2, 3, 1), strict=True)]
+    assert [(one.doubts, one.advice) for one in again] == expected[:3]
+    assert len(calls) == 1
+    # other labels have other borders
+    other = dataclasses.replace(again[0], labels=torch.where(scene.labels == 1, 0, scene.labels))
+    assert other.select(2).doubts == dataclasses.replace(other, target=2).doubts
+    assert len(calls) == 3
 
 
 def test_a_target_of_two_parts_apart_in_depth_is_told_unless_its_mask_is_given():

@@ -173,7 +173,7 @@ def plan_scene(
         elif any(thing.success >= enough for thing in plans):
             plans.append(ThingPlan(label, 0.0, reason="not tried: another object is easy enough"))
         else:
-            plans.append(_plan_thing(dataclasses.replace(scene, target=label), plan))
+            plans.append(_plan_thing(scene.select(label), plan))
     # known success (highest first), then unknown success (NaN), then no grasp
     plans.sort(
         key=lambda x: (

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.pose import check_sizes, find_plausible, tell_furniture, tell_tilt
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
-from torchgrasp.foundation.base import Value, settle
+from torchgrasp.foundation.base import Value, kept, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage, spatial
@@ -329,7 +329,7 @@ class Scene(Value):
         if isinstance(target, int) and not isinstance(target, bool):
             if target not in self.things:
                 raise BadArgument("target", target, f"a label of an object: {list(self.things)}")
-            return dataclasses.replace(self, target=target)
+            return self._aimed(target)
         place = torch.as_tensor(np.asarray(target), dtype=torch.float64)
         if place.shape not in ((2,), (3,)) or not bool(torch.isfinite(place).all()):
             raise BadArgument("point", repr(target), "a pixel (u, v) or a point (x, y, z)")
@@ -350,7 +350,14 @@ class Scene(Value):
             raise BadArgument(
                 "point", f"{text} on the table, or on no object", "a place on an object"
             )
-        return dataclasses.replace(self, target=label)
+        return self._aimed(label)
+
+    def _aimed(self, target: int) -> "Scene":
+        """Return the scene with another target; the borders of its objects are searched once."""
+        scene = dataclasses.replace(self, target=target)
+        # borders do not depend on the target
+        vars(scene)["_source"] = vars(self).get("_source", self)
+        return scene
 
     @property
     def advice(self) -> tuple[str, ...]:
@@ -372,15 +379,14 @@ class Scene(Value):
             "give it as the table to choose it"
             for plane in self.others
         ]
-        guesses = self._guesses()
-        found += [sentence for _, sentence in guesses]
+        found += [sentence for _, sentence in self._guesses]
         if self.image.at_border(self.pixels[self.rows_of()]):
             fix = "its other part is unknown; turn the camera to it"
             found.append(f"the target is cut off at the border of the image: {fix}")
         for k, share in self.covers.items():
             fix = f"turn the camera, or take object {k} away first"
             found.append(f"object {k} stands before {share:.0%} of the target's outline: {fix}")
-        if self._on_target(guesses):
+        if self.doubts:
             found.append(
                 "the target's outline is a guess, so its success is unknown: give its mask"
             )
@@ -394,50 +400,39 @@ class Scene(Value):
         Empty without a target. Empty for a target that is `given`, too: its outline is no guess.
         """
         # the search for guesses goes over the whole image
-        return () if self._is_sure else self._on_target(self._guesses())
-
-    @property
-    def _is_sure(self) -> bool:
-        """Whether there is no target, or one whose outline is `given`."""
-        return self.target is None or self.target in self.given
-
-    def _on_target(self, guesses: list[Guess]) -> tuple[str, ...]:
-        """Return the sentences of those guesses that are on a target which is not `given`."""
-        if self._is_sure:
+        if self.target is None or self.target in self.given:
             return ()
-        return tuple(sentence for labels, sentence in guesses if self.target in labels)
+        return tuple(sentence for labels, sentence in self._guesses if self.target in labels)
 
-    def _guesses(self) -> list[Guess]:
-        """Return the labels of objects whose outlines are guesses, each time with a sentence that
-        says why.
+    @kept
+    def _borders(self) -> "_Borders":
+        """The borders of the objects, which are the same for every target."""
+        source: Scene | None = vars(self).get("_source")
+        return _Borders.of(settle(self, torch.device("cpu"))) if source is None else source._borders
+
+    @kept
+    def _guesses(self) -> tuple[Guess, ...]:
+        """The labels of objects whose outlines are guesses, each time with a sentence that says
+        why.
         """
         found = list[Guess]()
-        scene = settle(self, torch.device("cpu"))
-        labels = scene.pixel_labels
-        points = scene.image.points()
-        for a, b in find_touching(scene.image, points, labels):
+        borders = self._borders
+        labels = borders.labels
+        for a, b in borders.touching:
             if a in self.given and b in self.given:
                 continue
             text = f"objects {a} and {b} touch, and their border is a guess: "
             found.append(((a, b), text + "give a mask of the one to grasp"))
-        parts = cut_creases(scene.image, points, labels)
         several = ": if it is several objects, give a mask of the one to grasp"
         for k in (k for k in self.things if k not in self.given):
-            sizes = parts[labels == k].unique(return_counts=True)[1]
+            sizes = borders.parts[labels == k].unique(return_counts=True)[1]
             if int((sizes > SCENE.part * sizes.sum()).sum()) > 1:
                 found.append(((k,), f"object {k} has a crease{several}"))
-            elif k == self.target and scene._jumps(labels == k):
+            elif k == self.target and borders.jump_in(k):
                 found.append(((k,), f"the target has a jump in depth{several}"))
-            elif k == self.target and scene._sprawls(labels):
+            elif k == self.target and settle(self, labels.device)._sprawls(labels):
                 found.append(((k,), f"the target is long and has gaps in its outline{several}"))
-        return found
-
-    def _jumps(self, mask: Bool[Tensor, "h w"]) -> bool:
-        """Return whether large parts of an object's pixels lie apart in depth."""
-        view = TableImage.of(self.image, SupportPlane(self.table or Plane.horizontal(0.0))).smooth
-        parts = find_components(view, mask & view.measured)
-        sizes = parts[parts > 0].unique(return_counts=True)[1]
-        return int((sizes > SCENE.apart * int(mask.sum())).sum()) > 1
+        return tuple(found)
 
     def _sprawls(self, labels: Int[Tensor, "h w"]) -> bool:
         """Return whether the target is long, and does not fill the convex hull of its pixels."""
@@ -581,6 +576,39 @@ class Scene(Value):
             table=None if self.table is None else Plane.horizontal(0.0),
             others=(),
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Borders:
+    """Where the objects of a scene may end: the places at which they touch, creases and jumps.
+
+    Attributes:
+        labels: label (h, w) of each pixel of the scene.
+        view: the scene's image above its table.
+        touching: pairs of labels of objects that touch.
+        parts: number (h, w) of the part, between creases, to which each object's pixel belongs.
+    """
+
+    labels: Int[Tensor, "h w"]
+    view: TableImage
+    touching: tuple[tuple[int, int], ...]
+    parts: Int[Tensor, "h w"]
+
+    @classmethod
+    def of(cls, scene: Scene) -> "_Borders":
+        """Return the borders of the objects of a scene on the CPU."""
+        view = TableImage.of(scene.image, SupportPlane(scene.table or Plane.horizontal(0.0)))
+        labels = scene.pixel_labels
+        touching = find_touching(scene.image, view.points, labels)
+        return cls(labels, view, tuple(touching), cut_creases(scene.image, view.points, labels))
+
+    def jump_in(self, label: int) -> bool:
+        """Return whether large parts of an object's pixels lie apart in depth."""
+        smooth = self.view.smooth
+        own = self.labels == label
+        parts = find_components(smooth, own & smooth.measured)
+        sizes = parts[parts > 0].unique(return_counts=True)[1]
+        return int((sizes > SCENE.apart * int(own.sum())).sum()) > 1
 
 
 def _target(points: Points, inside: Tensor | None) -> Target | None:
