@@ -14,6 +14,7 @@ from tests.make import HALF, halved
 from torchgrasp import Scene, Status, load_grasps, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.geometry.support_planes import find_supports
 from torchgrasp.planner import ScenePlan, ThingPlan
 
 CAMERA = look_at(20.0, 45.0, 0.7)
@@ -174,6 +175,41 @@ def test_objects_that_the_library_found_are_found_again_on_another_table(
     assert (
         before & after
     ).sum() > 0.95 * before.sum() and after.sum() > 1.2 * before.sum()  # down to the table
+
+
+@pytest.mark.parametrize(
+    ("options", "given", "searches"),
+    [
+        ((), {}, 1),
+        (("--up", "0", "0.1", "1"), {"up": (0.0, 0.1, 1.0)}, 1),
+        (("--table", "0.001"), {"table": 0.001}, 0),
+    ],
+)
+def test_planes_are_searched_once_at_most(
+    seen, tmp_path, planned, grasp_on, monkeypatch, options, given, searches
+):
+    calls = []
+
+    def count(*arguments):
+        calls.append(arguments)
+        return find_supports(*arguments)
+
+    monkeypatch.setattr("torchgrasp.geometry.support_planes.find_supports", count)
+    bare = {name: seen[name] for name in ("depth", "intrinsics", "camera_pose")}
+    np.savez(tmp_path / "s.npz", **bare)
+    grasp_on(*options)
+    assert len(calls) == searches and len(planned) == 1
+    assert planned[0] == Scene.from_depth(*bare.values(), **given)
+
+
+def test_a_given_table_helps_where_none_is_found(seen, tmp_path, planned, grasp_on):
+    bare = {name: seen[name] for name in ("depth", "intrinsics", "camera_pose")}
+    bare["depth"] = bare["depth"] * (seen["labels"] == 1)
+    np.savez(tmp_path / "s.npz", **bare)
+    assert "plane" in grasp_on() and not planned
+    grasp_on("--table", "0")
+    assert planned[0].things == (1,) and planned[0].table.offset == 0.0
+    assert "--table: expected" in grasp_on("--table", "5")
 
 
 def test_beside_a_mask_of_the_user_other_objects_are_found_again(tmp_path, planned, grasp_on):

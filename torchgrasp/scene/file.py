@@ -2,9 +2,11 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
@@ -48,17 +50,28 @@ def read_scene(path: Path | str) -> Scene:
     >>> read_scene(save_scene(load_scene(), Path(tempfile.mkdtemp(), "scene.npz"))).things
     (1, 2, 3, 4)
     """
-    arrays = read_arrays(Path(path))
-    table, pose, target = (arrays.pop(name, None) for name in ("table", "camera_pose", "target"))
-    others = arrays.pop("others", np.empty((0, 4)))
-    bounded = bool(arrays.pop("bounded", True))
-    unread = arrays.pop("unread")
+    return scene_of(read_arrays(Path(path)))
+
+
+def scene_of(
+    arrays: dict[str, Any], table: Plane | float | None = None, up: Tensor | None = None
+) -> Scene:
+    """Return the scene of a file's arrays, from `read_arrays`, as `read_scene` does.
+
+    Without a table among them, `table` and `up` are those of `Scene.from_depth`.
+    """
+    left = dict(arrays)
+    own_table, pose, target = (left.pop(name, None) for name in ("table", "camera_pose", "target"))
+    others = left.pop("others", np.empty((0, 4)))
+    bounded = bool(left.pop("bounded", True))
+    unread = left.pop("unread")
     notes = (f"arrays {', '.join(unread)[:SHOWN_LETTERS]} were not read",) if unread else ()
-    given = arrays.pop("given", [] if table is not None and "labels" in arrays else None)
-    rows = [] if table is None else [table, *others]
-    plane, *rest = [Plane(torch.tensor(row[:3]), float(row[3])) for row in rows] or [None]
+    given = left.pop("given", [] if own_table is not None and "labels" in left else None)
+    rows = [] if own_table is None else [own_table, *others]
+    plane, *rest = [Plane(torch.tensor(row[:3]), float(row[3])) for row in rows] or [table]
+    up = up if own_table is None else None
     scene = Scene.from_depth(
-        arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane
+        left.pop("depth"), left.pop("intrinsics"), pose, **left, table=plane, up=up
     )
     own = scene.given if given is None else tuple(label for label in scene.things if label in given)
     image = dataclasses.replace(scene.image, bounded=bounded)

@@ -44,8 +44,8 @@ from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.objects import take_target
 from torchgrasp.planner.scene_plan import plan_scene
-from torchgrasp.scene.file import read_scene
-from torchgrasp.scene.image import is_scene
+from torchgrasp.scene.file import scene_of
+from torchgrasp.scene.image import is_scene, read_arrays
 from torchgrasp.scene.masks import label_again
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
@@ -360,10 +360,18 @@ class Grasp(ForPrograms):
             name: f"CLOUD: {name}"
             for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")
         }
-        with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
-            scene = read_scene(path)
-        with naming(table="--table", up="--up", target="--label", point="--point"):
-            scene = self._with_table(scene, choice is not None)
+        names |= {"path": "CLOUD", "points": "CLOUD", "target": "--label", "point": "--point"}
+        options = {"table": "--table", "up": "--up"}
+        with naming(**names):
+            arrays = read_arrays(path)
+        found = "table" in arrays
+        with naming(**names if found else names | options):
+            # a table that is given is not searched first
+            scene = scene_of(arrays, self.view.given_table, self.view.vertical)
+        with naming(**options, target="--label", point="--point"):
+            # the shot of a live camera is on the table of the options
+            if found and not self.realsense:
+                scene = self._with_table(scene, choice is not None)
             scene = scene if choice is None else scene.select(choice)
         progress = StageProgress("scene", *["fingers"] * (among is not None), *STAGES, "report")
         with progress.bar, inputs.holding("--out", out):
@@ -418,10 +426,8 @@ class Grasp(ForPrograms):
             return scene
         image = scene.image
         name = "--up" if self.view.table is None else "--table"
-        table = None if self.view.table is None else self.view.plane(PointCloud(scene.points))
-        supports = find_plausible(
-            scene.points, image.obj_from_camera, table, self.view.vertical, known_unit=True
-        )
+        table, up = self.view.given_table, self.view.vertical
+        supports = find_plausible(scene.points, image.obj_from_camera, table, up, known_unit=True)
         labels = label_again(
             image, scene.table, supports[0], scene.pixel_labels, scene.given, scene.target or 0
         )

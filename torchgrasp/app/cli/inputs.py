@@ -147,6 +147,18 @@ class CloudOptions(ViewOptions):
         known: Any = {**vars(self), "table": (*file.table.normal.tolist(), file.table.offset)}
         return CloudOptions(**known)
 
+    @property
+    def given_table(self) -> Plane | float | None:
+        """The table of --table, as a plane or as a height z [m]; None if it is not given."""
+        if self.table is None:
+            return None
+        given = read_table(self.table)
+        return given if isinstance(given, Plane) else self._at(given)
+
+    def _at(self, height: float) -> Plane | float:
+        """Return the level plane at a height [m] along the vertical."""
+        return height if self.vertical is None else Plane(self.vertical, height)
+
     def plane(self, cloud: PointCloud) -> Plane | float | None:
         """Return the table as a plane or as a height z [m]; None means no table.
 
@@ -159,14 +171,11 @@ class CloudOptions(ViewOptions):
             )
         if self.no_table:
             return None
+        if table is not None:
+            return self.given_table
         up = self.vertical
-        given = None if table is None else read_table(table)
-        if isinstance(given, Plane):
-            return given
-        if given is None:
-            seen = cloud.points[find_inliers(cloud.points.double())]
-            given = float((seen[:, 2] if up is None else seen.double() @ up).min())
-        return given if up is None else Plane(up, given)
+        seen = cloud.points[find_inliers(cloud.points.double())]
+        return self._at(float((seen[:, 2] if up is None else seen.double() @ up).min()))
 
     def given_vertical(self, plane: Plane | None) -> Tensor | None:
         """Return the unit vector of --up, else the normal of --table; None if neither is given.

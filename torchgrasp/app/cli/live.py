@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from torchgrasp.app.cli.command import naming
-from torchgrasp.app.cli.inputs import ViewOptions, holding
+from torchgrasp.app.cli.inputs import CloudOptions, holding
 from torchgrasp.app.report.scene_picture import draw_scene
 from torchgrasp.cloud.pose import read_pose
 from torchgrasp.cloud.realsense import shoot_depth
@@ -14,21 +14,21 @@ LIVE = "scene.npz"
 """Name of the file of a live camera's scene, in the output folder."""
 
 
-def shoot_scene(out: Path, serial: str | None, view: ViewOptions) -> Path:
+def shoot_scene(out: Path, serial: str | None, view: CloudOptions) -> Path:
     """Take the depth image of a RealSense, write the scene and its picture into a folder; return
     the scene's path.
 
-    `serial` is the number of the camera, None means the only one. The `view` gives the vertical and
-    the camera's pose. Raises `BadArgument` for what `shoot_depth` and `Scene.from_depth` refuse.
+    `serial` is the number of the camera, None means the only one. The `view` gives the table, the
+    vertical and the camera's pose. Raises `BadArgument` for what `shoot_depth` and
+    `Scene.from_depth` refuse.
     """
     camera = dict.fromkeys(("camera", "depth", "intrinsics", "frames", "points"), "--realsense")
-    with naming(**camera, serial="--serial", camera_pose="--camera-pose", up="--up"):
+    options = {"camera_pose": "--camera-pose", "up": "--up", "table": "--table"}
+    with naming(**camera, **options, serial="--serial"):
         pose = None if view.camera_pose is None else read_pose("camera_pose", view.camera_pose)
-        vertical = view.vertical
+        given = {"table": view.given_table, "up": view.vertical}
         shot = shoot_depth(serial)
-        scene = Scene.from_depth(
-            shot.depth, shot.intrinsics, pose, up=vertical, depth_unit=shot.unit
-        )
+        scene = Scene.from_depth(shot.depth, shot.intrinsics, pose, **given, depth_unit=shot.unit)
     with holding("--out", out):
         path = save_scene(scene, out / LIVE)
         draw_scene(scene, path.with_suffix(".png"))
