@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation
 
 from tests.make import HALF, halved
 from torchgrasp import Scene, Status, load_grasps, read_scene, save_scene
-from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.support_planes import find_supports
 from torchgrasp.planner import ScenePlan, ThingPlan
@@ -212,8 +212,7 @@ def test_a_given_table_helps_where_none_is_found(seen, tmp_path, planned, grasp_
     assert "--table: expected" in grasp_on("--table", "5")
 
 
-def test_beside_a_mask_of_the_user_other_objects_are_found_again(tmp_path, planned, grasp_on):
-    seen = arrays_of(*render_depth(boxes(), CAMERA), INTRINSICS)
+def test_beside_a_mask_of_the_user_other_objects_are_found_again(seen, tmp_path, planned, grasp_on):
     scene = write(tmp_path / "s.npz", seen, 0.03, mask=seen["labels"] == 2)
     words = grasp_on("--table", "0.0")
     assert (

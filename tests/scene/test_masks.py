@@ -1,3 +1,4 @@
+import dataclasses
 import functools
 
 import numpy as np
@@ -5,7 +6,7 @@ import pytest
 import torch
 
 from tests.make import box
-from torchgrasp import Scene
+from torchgrasp import Scene, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.scene.masks import read_labels, read_mask
@@ -149,3 +150,51 @@ def test_a_photograph_is_no_mask():
             BadArgument, match=r"mask: expected at most 1000 objects, got 4.* as of a photograph"
         ):
             read_mask(given, (60, 80))
+
+
+TALL = look_at(20.0, 45.0, 0.7)
+
+
+@functools.cache
+def tall(noise: bool):
+    """Depth and labels of a tall box, one side of which is seen at a grazing angle, and another."""
+    boxes = [box([0.06, 0.06, 0.12]), box([0.06, 0.06, 0.08], [0.02, 0.15])]
+    return render_depth(boxes, TALL, noise=noise)
+
+
+def thinned(step: int, first: int, noise: bool = True):
+    """Return depth, labels and intrinsics of each `step`-th row and column from the `first` on."""
+    k = INTRINSICS.clone()
+    k[:2, 2] -= first
+    k[:2] /= step
+    depth, labels = (image[first::step, first::step].contiguous() for image in tall(noise))
+    return depth, labels, k
+
+
+# the last has 213 x 160 pixels
+@pytest.mark.parametrize(("step", "first"), [(1, 0), (2, 0), (2, 1), (3, 1)])
+@pytest.mark.parametrize("label", [1, 2])
+def test_a_mask_keeps_its_surface_in_an_image_of_any_size(step, first, label):
+    depth, labels, k = thinned(step, first)
+    exact = thinned(step, first, noise=False)[0]
+    mask = labels == label
+    scene = Scene.from_depth(depth, k, TALL, mask=mask, table=0.0)
+    kept = scene.pixel_labels == 1
+    assert not bool((kept & ~mask).any())
+    # not flying, and above the foot
+    surface = mask & (depth > 0) & ((depth - exact).abs() < 0.005)
+    surface &= scene.table.height(scene.image.points()) > 0.01
+    assert int((surface & ~kept).sum()) < 0.01 * int(surface.sum())
+    flying = mask & (depth - exact > 0.02)
+    assert int((kept & flying).sum()) < 0.005 * int(kept.sum())
+
+
+@pytest.mark.parametrize(("step", "first"), [(1, 1), (2, 0), (3, 1)])
+@pytest.mark.parametrize("label", [1, 2])
+def test_a_scene_of_a_mask_is_read_again_as_it_was_saved(tmp_path, step, first, label):
+    depth, labels, k = thinned(step, first)
+    # whole millimetres, and a table too high: many pixels are at a bound
+    counts = (1e3 * depth).round().numpy().astype(np.uint16)
+    scene = Scene.from_depth(counts, k, TALL, mask=labels == label, table=0.03)
+    again = read_scene(save_scene(scene, tmp_path / "scene.npz"))
+    assert dataclasses.replace(again, notes=scene.notes) == scene

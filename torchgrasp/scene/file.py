@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from torchgrasp.files import write_file
@@ -14,6 +15,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.limits import SHOWN_LETTERS
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import read_arrays
+from torchgrasp.scene.masks import read_labels
 from torchgrasp.scene.scene import Scene
 
 
@@ -34,8 +36,9 @@ def read_scene(path: Path | str) -> Scene:
     * `target`: label of the object to be grasped.
     * `table` (4,): numbers (nx, ny, nz, d) of the plane n . p = d [m], with the unit normal n.
     * `others` (k, 4): such numbers of other planes on which objects could stand.
-    * `given`: labels that a user made, as in `Scene.given`. If it is missing, the user made all
-      labels, or none in a file with `table` and `labels`.
+    * `given`: labels that a user made, as in `Scene.given`. The pixels of other labels then stay as
+      they are. If it is missing, the user made all labels, or none in a file with `table` and
+      `labels`.
     * `bounded`: False for an image made of a cloud, whose border is not that of the camera's view.
       If it is missing, it is True.
 
@@ -73,6 +76,8 @@ def scene_of(
     scene = Scene.from_depth(
         left.pop("depth"), left.pop("intrinsics"), pose, **left, table=plane, up=up
     )
+    if {"given", "labels"} <= arrays.keys():
+        scene = _with_found(scene, read_labels(arrays["labels"], scene.image.depth.shape), given)
     own = scene.given if given is None else tuple(label for label in scene.things if label in given)
     image = dataclasses.replace(scene.image, bounded=bounded)
     others = (*rest, *scene.others)
@@ -81,12 +86,21 @@ def scene_of(
     return scene if target is None else scene.select(int(target))
 
 
+def _with_found(scene: Scene, labels: Int[Tensor, "h w"], given: np.ndarray) -> Scene:
+    """Return the scene with the saved `labels` of those objects whose labels are not `given`: the
+    library found their pixels, and none of them is on the table.
+    """
+    saved = labels[tuple(scene.pixels.T)]
+    found = (saved > 0) & ~torch.isin(saved, torch.from_numpy(given))
+    return dataclasses.replace(scene, labels=torch.where(found, saved, scene.labels))
+
+
 @checked
 def save_scene(scene: Scene, path: Path | str) -> Path:
     """Write a scene as .npz, atomically, for `read_scene`. Return the path.
 
-    The file holds the arrays that `read_scene` lists, with depth [m] in float32. It does not hold
-    `notes`, and of several points in one pixel only the nearest.
+    The file holds the arrays that `read_scene` lists. It does not hold `notes`, and of several
+    points in one pixel only the nearest.
 
     Raises `BadArgument` for a path that does not end in .npz, and `OutputError` if the file cannot
     be written.
@@ -101,7 +115,8 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
         raise BadArgument("path", path, "a file ending in .npz")
     labels = scene.pixel_labels.cpu().numpy().astype(np.int32)
     arrays = {
-        "depth": scene.image.depth.cpu().numpy().astype(np.float32),
+        # a rounded depth could move a pixel beyond a bound, and out of its mask
+        "depth": scene.image.depth.cpu().numpy(),
         "intrinsics": scene.image.intrinsics.cpu().numpy(),
         "camera_pose": scene.image.obj_from_camera.cpu().numpy(),
         "labels": labels,

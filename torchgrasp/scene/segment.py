@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.lazy import ndimage, spatial
@@ -33,6 +33,10 @@ class SegmentNumbers:
     """Least height of a pixel itself, over the least mean height around it."""
     near: float = 0.005
     """A pixel at a jump of depth joins an object within this distance [m]."""
+    near_pixels: float = 4.0
+    """A pixel of a given mask also joins one within this distance, in widths of a pixel: pixels of
+    a small image lie farther apart.
+    """
     rounds: int = 12
     """Most rounds in which objects grow into pixels at jumps."""
     few: int = 6
@@ -127,7 +131,8 @@ def rests_on(view: TableImage) -> Bool[Tensor, "h w"]:
     Flying pixels are left out.
     """
     risen = _risen(view)
-    return _grown(view, _core(view.smooth, risen).long(), risen) > 0
+    near = (SEGMENT.near_pixels * view.image.depth / view.image.focal).clamp_min(SEGMENT.near)
+    return _grown(view, _core(view.smooth, risen).long(), risen, near) > 0
 
 
 def _risen(view: TableImage) -> Bool[Tensor, "h w"]:
@@ -187,10 +192,15 @@ def find_components(smooth: TableImage, core: Tensor) -> Int[Tensor, "h w"]:
     return torch.where(core, number.reshape(h, w) + 1, 0)
 
 
-def _grown(view: TableImage, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
+def _grown(
+    view: TableImage, labels: Tensor, risen: Tensor, near: Float[Tensor, "h w"] | None = None
+) -> Int[Tensor, "h w"]:
     """Return labels in which pixels above the table without a label get that of the nearest point,
     if one is near.
+
+    `near` is the greatest distance [m] of each pixel from such a point, by default `SEGMENT.near`.
     """
+    wide = np.full(risen.shape, SEGMENT.near) if near is None else near.double().numpy()
     labels = torch.where((count_labels(labels) < SEGMENT.few)[labels], 0, labels).reshape(-1)
     place = view.points.reshape(-1, 3).numpy()
     loose = torch.nonzero(risen.reshape(-1) & (labels == 0))[:, 0]
@@ -198,10 +208,11 @@ def _grown(view: TableImage, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"
     for _ in range(SEGMENT.rounds):
         if not len(new) or not len(loose):
             break
+        reach = wide.reshape(-1)[loose.numpy()]
         distance, index = spatial.KDTree(place[new.numpy()]).query(
-            place[loose.numpy()], distance_upper_bound=SEGMENT.near
+            place[loose.numpy()], distance_upper_bound=reach.max()
         )
-        found = torch.from_numpy(np.isfinite(distance))
+        found = torch.from_numpy(distance <= reach)
         labels[loose[found]] = labels[new[torch.from_numpy(index)[found]]]
         # the pixels found last are those at which an object grows on
         new = loose[found]
