@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
-from tests.make import HALF, halved
+from tests.make import HALF, box, halved
 from torchgrasp import Scene, Status, load_grasps, read_scene, save_scene
 from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.foundation.errors import BadArgument
@@ -116,6 +116,33 @@ def test_without_a_choice_the_easiest_thing_is_taken_and_all_are_listed(seen, gr
         and "too heavy" in words
         and "no executable grasp of any object" in words
     )
+
+
+TOUCHING = [((0.06, 0.08, 0.12), (-0.031, 0.0)), ((0.06, 0.1, 0.05), (0.03, 0.02))]
+APART = [((0.05, 0.05, 0.09), (0.0, -0.06)), ((0.05, 0.05, 0.09), (0.0, 0.06))]
+
+
+@pytest.mark.parametrize(
+    ("bodies", "choice"), [(TOUCHING, ("--label", "1")), (TOUCHING, ()), (APART, ())]
+)
+def test_why_the_success_of_an_outline_is_unknown_is_told_in_words_and_as_json(
+    tmp_path, run_command, bodies, choice
+):
+    depth, labels = map(halved, render_depth([box(*one) for one in bodies], CAMERA))
+    arrays = arrays_of(depth, labels, HALF)
+    del arrays["labels"]
+    path = tmp_path / "scene.npz"
+    np.savez(path, **arrays)
+    options = ("--hand", "barrett", "--starts", "10", "--out", tmp_path / "out", *choice)
+    code, out, err = run_command("grasp", path, *options, "--json")
+    told = json.loads(out)
+    assert code == 0 and told["executable"] > 0
+    doubts = read_scene(path).select(told["label"]).doubts
+    assert told["doubts"] == list(doubts) and bool(doubts) == (bodies is TOUCHING)
+    assert (told["best"]["success"] is None) == bool(doubts)
+    for sentence in doubts:
+        assert err.count(f"advice  {sentence}") == 1
+    assert err.count("its success is unknown") == bool(doubts)
 
 
 def write(path: Path, seen: dict[str, np.ndarray], table: float, **choice: object) -> Scene:

@@ -629,9 +629,11 @@ class PlanFromDepth(_PlanTool):
                 objects=rows,
                 notes=seen.notes,
             )
-        chosen = dataclasses.replace(scene, target=best.label)
+        chosen = scene.select(best.label)
         save_scene(chosen, file)
-        seen = dataclasses.replace(seen, source=chosen)
+        # some advice is on the target alone
+        notes = dict.fromkeys((*seen.notes, *chosen.advice))
+        seen = dataclasses.replace(seen, source=chosen, notes=tuple(notes))
         told = {"shape": best.shape}
         hand = hand_of(best.grasps, hand)
         name = f"object {best.label}"

@@ -395,6 +395,10 @@ class Grasp(ForPrograms):
                     answer({"executable": 0, "hand": hand.name, "best": None})
                     return 1
                 scene, grasps, shape = best
+                # some advice is on the target alone
+                for sentence in scene.advice:
+                    if sentence not in advice:
+                        print(f"advice  {sentence}")
             spec = dataclasses.replace(spec, table=scene.table)
             cloud = take_target(scene, self.seed)
             name = f"object {scene.target}"
@@ -415,7 +419,8 @@ class Grasp(ForPrograms):
         executable = print_grasps(run)
         if clear:
             print(f"take away first  {words}; object {scene.target} then has a grasp")
-        answer(describe_run(run, out) | {"label": scene.target, "clear": list(clear)})
+        of_scene = {"label": scene.target, "clear": list(clear), "doubts": list(scene.doubts)}
+        answer(describe_run(run, out) | of_scene)
         return 0 if executable else 1
 
     def _with_table(self, scene: Scene, chosen: bool) -> Scene:
@@ -494,7 +499,7 @@ class Grasp(ForPrograms):
             return print(
                 f"The {hand.name} hand has no executable grasp of any object in the scene.\n{help}"
             )
-        return dataclasses.replace(scene, target=plan.best.label), plan.best.grasps, plan.best.shape
+        return scene.select(plan.best.label), plan.best.grasps, plan.best.shape
 
 
 def print_grasps(run: Run) -> bool:
