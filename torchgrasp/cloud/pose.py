@@ -230,8 +230,9 @@ def find_plausible(
     plane.
     """
     eye = pose[:3, 3]
+    image_up = -pose[:3, 1] if up is None and _is_own(pose) else None
     try:
-        supports = find_table(points, eye, table, up, target)
+        supports = find_table(points, eye, table, up, target, image_up)
         if table is None and up is None and not _is_own(pose):
             supports = _level(supports, points, eye, target)
     except NoSupport:

@@ -107,19 +107,27 @@ class SeenPoints:
         points: (n, 3) [m].
         eye: position (3,) [m] of the camera; None if unknown.
         sky: upward unit vector (3,); None if unknown.
+        image_up: upward unit vector (3,) of the camera's image; None if unknown.
 
     `noise` (n,) [m] is the assumed noise of the points.
     """
 
-    def __init__(self, points: Points, eye: Vector | None, sky: Vector | None) -> None:
+    def __init__(
+        self,
+        points: Points,
+        eye: Vector | None,
+        sky: Vector | None,
+        image_up: Vector | None = None,
+    ) -> None:
         self.points = points
         self.eye = eye
         self.sky = sky
+        self.image_up = image_up
         self.noise = assume_noise(points, eye)
 
     def part(self, of: Bool[Tensor, "n"]) -> "SeenPoints":
         """Return some of the points, given by a mask, in the same frame."""
-        return SeenPoints(self.points[of], self.eye, self.sky)
+        return SeenPoints(self.points[of], self.eye, self.sky, self.image_up)
 
 
 @dataclasses.dataclass(frozen=True)

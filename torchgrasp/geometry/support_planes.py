@@ -50,6 +50,16 @@ class SupportNumbers:
     """Border of the region, over its width, through which the camera may see points."""
     bowed: float = 0.5
     """Factor on the score of a support that is flat in a small part only."""
+    flat: float = 1.1
+    """Greatest scale (ratio of measured to assumed noise) of a small part that is as flat as the
+    noise, and thus not bowed.
+    """
+    downward: float = 0.3
+    """Least cosine between the normal and the image's downward direction of a plane that an upright
+    camera cannot see from above: a wall faces a camera that looks down so.
+    """
+    upside_down: float = 0.5
+    """Factor on the score of such a plane: few cameras are upside down."""
     plausible: float = 0.2
     """Least score of a support at an angle to the best one, over the best: a wall has less."""
     margin: float = 0.1
@@ -84,8 +94,10 @@ class SupportNumbers:
     """Depth of a point below a support, over the tolerance of points on it: dark feet sag less."""
     below: float = 0.2
     """Least ratio of points below to points above a support, in a column that goes through it."""
-    most_pierced: float = 0.05
-    """Greatest share of the low points over a support that continue below it."""
+    most_pierced: float = 0.15
+    """Greatest share of the low points over a support that continue below it: between slats, some
+    points of an object do.
+    """
     least_standing: float = 0.001
     """Least share of all points that lie low above a support, over its region."""
     least_low: float = 0.05
@@ -185,6 +197,7 @@ def find_table(
     table: Plane | float | None,
     up: object,
     target: Target | None = None,
+    image_up: Vector | None = None,
 ) -> tuple[SupportPlane, ...]:
     """Return the support on a given table, or all supports found in the points, the most plausible
     first.
@@ -195,6 +208,7 @@ def find_table(
         table: the table as a plane, or its height [m] along z; None to search for supports.
         up: upward direction, three numbers of any length; None if unknown.
         target: a thing on the support; None if unknown. Supports that carry it come first.
+        image_up: upward direction (3,) of the camera's image, as for `find_supports`.
 
     Raises `BadArgument` for a camera below the table, or `up` far from the table's normal;
     `NoSupport` if none is found.
@@ -202,7 +216,7 @@ def find_table(
     plane = as_plane(table)
     direction = None if up is None else torch.as_tensor(up, dtype=torch.float64).cpu()
     if plane is None:
-        return _find_under(target, points, viewpoint, direction)
+        return _find_under(target, points, viewpoint, direction, image_up)
     if direction is not None and float(unit(direction) @ plane.normal.double()) < 0.5:
         allowed = "a direction within 60 degrees of the table's normal"
         raise BadArgument("up", direction.tolist(), allowed)
@@ -217,7 +231,11 @@ def find_table(
 
 
 def _find_under(
-    target: Target | None, points: Points, viewpoint: Vector, up: Vector | None
+    target: Target | None,
+    points: Points,
+    viewpoint: Vector,
+    up: Vector | None,
+    image_up: Vector | None,
 ) -> tuple[SupportPlane, ...]:
     """Return the supports in a view; those that carry the target first.
 
@@ -225,11 +243,11 @@ def _find_under(
     `find_table`.
     """
     if target is None:
-        return find_supports(points, viewpoint, up)
+        return find_supports(points, viewpoint, up, image_up=image_up)
     missing = None
     found: tuple[SupportPlane, ...] = ()
     try:
-        found = find_supports(points, viewpoint, up)
+        found = find_supports(points, viewpoint, up, image_up=image_up)
     except NoSupport as error:
         missing = error
     carrying = [support for support in found if target.stands_on(support)]
@@ -278,6 +296,7 @@ def find_supports(
     viewpoint: Vector | None = None,
     up: Vector | None = None,
     least_width: float = SUPPORTS.least_width,
+    image_up: Vector | None = None,
 ) -> tuple[SupportPlane, ...]:
     """Return the planes that support objects in a view, the most plausible first.
 
@@ -287,11 +306,13 @@ def find_supports(
             is the upper one.
         up: upward direction (3,) of any length; None allows any direction.
         least_width: least width [m] of a support's region.
+        image_up: upward direction (3,) of the camera's image; None if unknown.
 
     Triples of points propose planes. An iterated fit with Tukey's weights refines each plane.
     Objects stand on a support, over its region, and the camera sees nothing through the region. The
     support with the most points low above it comes first. The points count twice if the camera
-    looks at the support, and half if it is bowed. Those on a wall beside it count a quarter. Walls
+    looks at the support, and half if it is bowed. They count half if the camera would have to be
+    upside down to see the support from above. Those on a wall beside it count a quarter. Walls
     beside the first support, on which far fewer points stand, are left out. Of parallel supports, a
     higher one as wide as furniture comes first. A
     rigid motion of all arguments moves the supports alike.
@@ -304,6 +325,8 @@ def find_supports(
         eye = check_tensor("viewpoint", viewpoint, (3,)).detach().cpu().double()
     if up is not None:
         sky = unit(check_tensor("up", up, (3,)).detach().cpu().double())
+    if image_up is not None:
+        image_up = unit(check_tensor("image_up", image_up, (3,)).detach().cpu().double())
     if len(points) < SUPPORTS.least_points:
         raise NoSupport("table", f"{len(points)} points", SUPPORT)
     generator = torch.Generator().manual_seed(0)
@@ -311,7 +334,7 @@ def find_supports(
     points = points[drawn]
     # The points are centred so that distant origins cost no digits.
     centre = points.mean(0)
-    view = SeenPoints(points - centre, None if eye is None else eye - centre, sky)
+    view = SeenPoints(points - centre, None if eye is None else eye - centre, sky, image_up)
     surfaces = [_FlatSurface.of(view, fit) for fit in fit_planes(view, generator)]
     found: list[_Candidate] = []
     reasons: list[str] = []
@@ -540,6 +563,7 @@ class _FlatSurface:
         """Return the surface of a fit, its normal turned to the upper side."""
         bowed = fit.scale >= PLANES.rough
         fit = (_refit(view, fit) if bowed else fit).turned_up(view)
+        bowed = bowed and fit.scale > SUPPORTS.flat
         height = view.points @ fit.normal - fit.offset
         tolerance = SUPPORTS.thickness * fit.scale * view.noise + SUPPORTS.least_thickness
         if bowed:
@@ -578,6 +602,8 @@ def _judge(
     reason = _refuse_plane(view, surface)
     if reason:
         return reason
+    if _is_wall(view, surface, surfaces):
+        return "a plane that is level only for a camera upside down, beside a larger one"
     # a narrower round face belongs to an object
     if support is None or support.width < wide:
         return f"a flat face about {surface.width:.2f} m wide"
@@ -611,6 +637,7 @@ def _judge(
     plain = _furniture(surface, surfaces, least_width)
     favour = SUPPORTS.favour if _looked_at(view, surface.fit, support) else 1.0
     favour *= SUPPORTS.bowed if surface.bowed else 1.0
+    favour *= SUPPORTS.upside_down if _leans(view, surface) < -SUPPORTS.downward else 1.0
     score = count - SUPPORTS.plain * int((risen.standing & plain).sum())
     return _Candidate(support, score * favour, middle, float(surface.tolerance[own].median()))
 
@@ -627,6 +654,28 @@ def _refuse_plane(view: SeenPoints, surface: _FlatSurface) -> str:
     if view.sky is not None and float(fit.normal @ view.sky) < level:
         return f"no plane within {PLANES.most_tilt:g} degrees of level"
     return ""
+
+
+def _leans(view: SeenPoints, surface: _FlatSurface) -> float:
+    """Return the cosine between a surface's normal and the image's upward direction; 0 if that is
+    unknown.
+    """
+    return 0.0 if view.image_up is None else float(surface.fit.normal @ view.image_up)
+
+
+def _is_wall(view: SeenPoints, surface: _FlatSurface, surfaces: list[_FlatSurface]) -> bool:
+    """Return whether a surface would be level for a camera upside down alone, and a larger one at an
+    angle to it is level for an upright camera.
+    """
+    if _leans(view, surface) > -SUPPORTS.downward:
+        return False
+    return any(
+        _leans(view, other) > SUPPORTS.downward
+        and other.beside(surface)
+        and other.width > SUPPORTS.furniture
+        and other.fit.count > surface.fit.count
+        for other in surfaces
+    )
 
 
 def _bends_away(view: SeenPoints, surface: _FlatSurface, support: SupportPlane, own: int) -> bool:
