@@ -112,6 +112,10 @@ class SupportNumbers:
     """Least width [m] of a support's region."""
     furniture: float = 0.3
     """Width [m] of a region from which it belongs to no object that a hand grasps."""
+    small_table: float = 0.2
+    """Least width [m] of a bowed support that is parallel to a plane as wide as furniture: above a
+    floor it is a small table.
+    """
     parallel: float = 0.985
     """Least cosine between the normals of parallel planes: ten degrees."""
     same: float = 0.02
@@ -584,6 +588,11 @@ class _FlatSurface:
         """Return whether this surface is at an angle to another one, as a wall to a table."""
         return abs(float(self.fit.normal @ other.fit.normal)) < SUPPORTS.askew
 
+    def parallel(self, other: "_FlatSurface") -> bool:
+        """Return whether another surface is parallel to this one, flat, and as wide as furniture."""
+        cosine = abs(float(self.fit.normal @ other.fit.normal))
+        return cosine > SUPPORTS.parallel and not other.bowed and other.width > SUPPORTS.furniture
+
     @property
     def width(self) -> float:
         """The least width [m] of the region."""
@@ -598,7 +607,10 @@ def _judge(
     Of the other `surfaces`, those of furniture do not stand on it.
     """
     support = surface.support
-    wide = SUPPORTS.furniture if surface.bowed else least_width
+    wide = least_width
+    if surface.bowed:
+        level = any(surface.parallel(other) for other in surfaces if other is not surface)
+        wide = SUPPORTS.small_table if level else SUPPORTS.furniture
     reason = _refuse_plane(view, surface)
     if reason:
         return reason
