@@ -126,3 +126,41 @@ def test_a_plane_that_objects_go_through_is_no_support():
     ):
         plane = fit_support(*look(meshes, table, pose))
         assert abs(plane.offset - height) < 0.003 and float(plane.normal[2]) > 0.999
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 180.0])
+def test_slats_support_though_thin_things_hang_between_them(azimuth):
+    bars = [box([0.6, 0.03, 0.02], [0.0, 0.05 * k, -0.01]) for k in range(-5, 6)]
+    pens = [
+        trimesh.creation.cylinder(0.008, 0.12).apply_translation([x, y, 0.01])
+        for x, y in ((0.12, -0.025), (-0.15, 0.075))
+    ]
+    balls = [
+        trimesh.creation.icosphere(radius=0.03).apply_translation([x, y, 0.027])
+        for x, y in ((0.1, 0.025), (-0.1, -0.075))
+    ]
+    can = trimesh.creation.cylinder(0.03, 0.1).apply_translation([0.0, 0.05, 0.05])
+    floor = box([2.0, 2.0, 0.02], [0.0, 0.0, -0.36])
+    pose = look_at(azimuth, 45.0, 0.8)
+    plane = fit_support(*look([*bars, *pens, *balls, can, floor], None, pose))
+    assert plane.normal[2] > 0.999 and abs(plane.offset) < 0.003
+
+
+def test_of_a_floor_and_a_wall_that_are_alike_the_cameras_upward_side_tells_which_is_level():
+    """The corner is its own mirror image, by which floor and wall change places."""
+    corner = [box([0.8, 0.8, 0.02], [0.4, 0.0, -0.01]), box([0.02, 0.8, 0.8], [-0.01, 0.0, 0.4])]
+    things = [
+        box([0.06, 0.06, 0.05], [0.3, 0.12, 0.025]),
+        box([0.05, 0.06, 0.06], [0.025, -0.12, 0.3]),
+    ]
+    pose = look_at(0.0, 45.0, 1.0)
+    points, eye = look([*corner, *things], None, pose)
+    assert len(find_supports(points, eye)) == 2
+    image_up = -pose[:3, 1]
+    for sign, normal in ((1.0, UP), (-1.0, real([1.0, 0.0, 0.0]))):
+        support = find_supports(points, eye, image_up=sign * image_up)[0]
+        assert float(support.plane.normal @ normal) > 0.999
+    # a wall that is smaller than the floor is none
+    lower = [corner[0], box([0.02, 0.8, 0.4], [-0.01, 0.0, 0.2])]
+    found = find_supports(*look([*lower, *things], None, pose), image_up=image_up)
+    assert len(found) == 1 and float(found[0].plane.normal @ UP) > 0.999
