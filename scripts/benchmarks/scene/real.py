@@ -1,4 +1,5 @@
-"""Real frames: the support against the true one, and the number of objects against the true number.
+"""Real frames: the support against the true one, also in varied images, and the number of objects
+against the true number.
 
 The folder of frames holds frames.json and, for each frame, NAME_depth.png and perhaps
 NAME_label.png. An entry of frames.json has `intrinsics`, the true `table_normal` in the camera's
@@ -7,15 +8,31 @@ frame, `camera_over_table_m` and `things`.
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
+from scipy.ndimage import affine_transform
 
 from benchmarks.common import Options, Row, bench
 from torchgrasp import Scene
+from torchgrasp.foundation.errors import NoSupport
+from torchgrasp.geometry.plane import Plane
+
+VARIANTS = 6
+"""Variants of each frame."""
+ROLL = 12.0
+CUT = 0.12
+NOISE = 0.002
+"""Greatest roll [deg] of a variant, greatest share that is cut from each side, and noise [1/m] over
+the squared depth.
+"""
+HOME = "home"
+HOME_DEGREES, HOME_MM = 4.5, 20.0
+"""Names of frames of homes begin so; bounds of their supports, which bow."""
 
 
 @bench("scene/real", objects=True)
@@ -42,6 +59,16 @@ def real(o: Options) -> list[Row]:
     kept = [share for name in names for share in kept_shares(folder, name, frames[name])]
     good = sum(share >= 0.95 for share in kept)
     support = f"{right} of {len(names)}; largest {worst[0]:.1f} degrees, {worst[1]:.1f} mm"
+    varied = [
+        judge_variant(folder, name, frames[name], [o.seed, i, k])
+        for i, name in enumerate(names)
+        for k in range(VARIANTS)
+    ]
+    good_ones = varied.count("right")
+    fates = ", ".join(
+        f"{varied.count(fate)} {fate}"
+        for fate in ("right", "offered", "vertical", "wrong", "refused")
+    )
     return [
         Row(
             "support of real frames",
@@ -49,6 +76,13 @@ def real(o: Options) -> list[Row]:
             support,
             right == len(names),
             errors,
+        ),
+        Row(
+            f"the same frames, mirrored, turned by up to {ROLL:g} degrees, cut and with noise",
+            "as before, in homes within 4.5 degrees and 20 mm",
+            f"of {len(varied)}: {fates}",
+            good_ones == len(varied),
+            {"varied": varied},
         ),
         Row(
             "objects of real frames",
@@ -75,11 +109,66 @@ def read(folder: Path, name: str, kind: str) -> np.ndarray:
 def support_error(scene: Scene, frame: dict[str, Any]) -> tuple[float, float]:
     """Return the tilt [deg] of the support, and the error [mm] of the camera's height above it."""
     assert scene.table is not None
-    tilt = float(
-        scene.table.normal.double() @ torch.tensor(frame["table_normal"], dtype=torch.float64)
-    )
-    height = float(scene.table.height(torch.zeros(3, dtype=torch.float64)))
-    return math.degrees(math.acos(min(1.0, tilt))), 1e3 * abs(height - frame["camera_over_table_m"])
+    return plane_error(scene.table, frame["table_normal"], frame["camera_over_table_m"])
+
+
+def plane_error(plane: Plane, normal: Sequence[float], height: float) -> tuple[float, float]:
+    """Return the angle [deg] of a plane to the true normal, and the error [mm] of the camera's
+    `height` [m] above it.
+    """
+    cosine = float(plane.normal.double() @ torch.tensor(normal, dtype=torch.float64))
+    found = float(plane.height(torch.zeros(3, dtype=torch.float64)))
+    return math.degrees(math.acos(min(1.0, cosine))), 1e3 * abs(found - height)
+
+
+def judge_variant(folder: Path, name: str, frame: dict[str, Any], seed: list[int]) -> str:
+    """Return what becomes of the support in a random variant of a frame.
+
+    It is "right", or "offered" behind another one. Else it is "vertical" if the first one is, or
+    "wrong", or "refused".
+    """
+    depth, intrinsics, normal = vary(folder, name, frame, np.random.default_rng(seed))
+    try:
+        supports = Scene.from_depth(depth, intrinsics).supports
+    except NoSupport:
+        return "refused"
+    degrees, mm = (HOME_DEGREES, HOME_MM) if name.startswith(HOME) else (2.0, 10.0)
+    errors = [plane_error(x, normal, frame["camera_over_table_m"]) for x in supports]
+    right = [angle < degrees and error < mm for angle, error in errors]
+    if any(right):
+        return "right" if right[0] else "offered"
+    return "vertical" if errors[0][0] > 45 else "wrong"
+
+
+def vary(
+    folder: Path, name: str, frame: dict[str, Any], draw: np.random.Generator
+) -> tuple[np.ndarray, list[float], np.ndarray]:
+    """Return a frame's depth image, turned about the camera's axis, cut, perhaps mirrored and with
+    noise; its intrinsics, with the size of the image; and the true normal in its camera's frame.
+    """
+    depth = read(folder, name, "depth")
+    fx, fy, cx, cy = frame["intrinsics"]
+    roll = math.radians(draw.uniform(-ROLL, ROLL))
+    cosine, sine = math.cos(roll), math.sin(roll)
+    # of (row, column), about the principal point
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    middle = np.array([cy, cx])
+    turned = affine_transform(depth, turn, middle - turn @ middle, order=0)
+    # of (x, y, z): from the frame as it was to the turned one
+    axes = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    normal = axes @ np.array(frame["table_normal"])
+    rows, columns = depth.shape
+    top, bottom = (draw.uniform(0, CUT, 2) * rows).astype(int)
+    left, right = (draw.uniform(0, CUT, 2) * columns).astype(int)
+    image = turned[top : rows - bottom, left : columns - right].astype(np.float64)
+    height, width = image.shape
+    intrinsics = [fx, fy, cx - left, cy - top, width, height]
+    if draw.random() < 0.5:
+        image = image[:, ::-1]
+        intrinsics[2] = width - 1 - intrinsics[2]
+        normal = normal * [-1.0, 1.0, 1.0]
+    noise = NOISE / 1000 * image**2 * draw.normal(size=image.shape)  # images are in millimetres
+    return (image + noise).clip(0).astype(depth.dtype), intrinsics, normal
 
 
 def kept_shares(folder: Path, name: str, frame: dict[str, Any]) -> list[float]:
