@@ -67,6 +67,7 @@ from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.testing import random_joints
 
+pytestmark = pytest.mark.usefixtures("kept")  # the shapes of the CPU alone
 SPEC = ContactSpec(table=0.0)
 CPU = torch.device("cpu")
 VIEW = load_object("cylinder").view
