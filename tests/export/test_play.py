@@ -37,7 +37,6 @@ CASES = (
     ("jug", "allegro", 4.0),
     ("jug", "barrett", 4.0),
     ("cylinder", "allegro", 0.25),
-    ("cylinder", "barrett", 0.25),
 )
 """Objects, hands and masses [kg] whose shipped grasps are played: the first is too heavy."""
 SPEC = TrialSpec(approach=0.05, hold_time=0.3)
