@@ -117,11 +117,11 @@ def test_a_hand_that_closed_beside_the_object_closes_once_more(seen, aside, simu
 @pytest.mark.parametrize("aside", [(0.0, 0.03)])
 def test_a_hand_that_touches_something_on_its_way_goes_round_it(seen, aside):
     """The object stands where the opened hand comes down: pushed over by one that goes on, held by
-    one that stops.
+    one that stops. Both close once.
     """
     swept, guarded = (
         close("allegro", cylinder(aside), dataclasses.replace(STILL, options=options), surface=seen)
-        for options in (ClosingOptions(stops=0), None)
+        for options in (ClosingOptions(stops=0, attempts=1), ClosingOptions(attempts=1))
     )
     assert (swept.stops, swept.held) == (0, False)
     assert guarded.stops >= 1 and guarded.held
