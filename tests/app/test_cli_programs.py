@@ -9,11 +9,12 @@ import time
 import pytest
 import torch
 
+from tests.make import HALF, halved
 from torchgrasp import cloud_from_depth, load_grasps, load_object
 from torchgrasp.app.cli import command
 from torchgrasp.app.cli.command import StageProgress, make_bar
 from torchgrasp.cloud import save_cloud
-from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.data.shipped import DATA
 
 QUICK = ("--starts", "8", "--no-report", "--hand", "barrett")
@@ -92,10 +93,10 @@ def test_a_simulators_cloud_with_its_table_is_planned_on_and_a_cameras_is_refuse
 ):
     """Oracle: the true labels of the image count the points of the table."""
     pose = look_at(azimuth=30.0, elevation=35.0, target=load_object("cylinder").mesh)
-    depth, labels = render_depth([load_object("cylinder").mesh], pose, noise=noise)
+    depth, labels = map(halved, render_depth([load_object("cylinder").mesh], pose, noise=noise))
     body = (labels == 1).double()[None, None]
-    around = torch.nn.functional.max_pool2d(body, 41, 1, 20)[0, 0] > 0
-    cloud = cloud_from_depth(depth, INTRINSICS, mask=around, camera_pose=pose)
+    around = torch.nn.functional.max_pool2d(body, 21, 1, 10)[0, 0] > 0
+    cloud = cloud_from_depth(depth, HALF, mask=around, camera_pose=pose)
     save_cloud(cloud, tmp_path / "cloud.npz")
     assert run_command("cloud", "check", tmp_path / "cloud.npz")[0] == int(noise)
     code, out, err = run_command("grasp", tmp_path / "cloud.npz", *QUICK, "--out", tmp_path / "out")
