@@ -73,7 +73,7 @@ def allegro(loop):
 
 
 @pytest.mark.sim
-@pytest.mark.parametrize(("feel", "rate"), [(True, 200.0), (False, 100.0)])
+@pytest.mark.parametrize(("feel", "rate"), [(True, 100.0), (False, 50.0)])
 def test_a_cylinder_is_lifted_through_messages(file, feel, rate):
     pytest.importorskip("mujoco")
     hand, grasp = pinch("allegro")
