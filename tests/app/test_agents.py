@@ -22,6 +22,7 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from tests.make import halved
 from torchgrasp import Distribution, GraspTask, load_grasps, load_object, load_scene
 from torchgrasp.app.cli import agent_server
 from torchgrasp.app.cli.agent_files import Workplace
@@ -42,6 +43,8 @@ ROOT = Path(__file__).parents[2]
 PYTHON = ROOT / ".beside" / "mcp" / "bin" / "python"
 COMMAND = (str(PYTHON), "-m", "torchgrasp", "mcp", "--folder")
 FEW = {"starts": 8, "most": 2}
+THING = 4
+"""The object of the shipped scene that is planned on."""
 UNITS = ("[m]", "[rad]", "[kg]", "[s]", "[pixels]", "[degrees]")
 
 
@@ -63,13 +66,13 @@ def converse(server, calls):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with a cloud, a bad cloud, a depth image, and a link out of it."""
+    """A folder with a cloud, a bad cloud, a depth image of half the size, and a link out of it."""
     place = tmp_path_factory.mktemp("agents")
     shutil.copy(DATA / "cylinder" / "view.ply", place / "tin.ply")
     np.save(place / "two.npy", np.random.default_rng(0).normal(size=(2, 3)))
     np.save(place / "mm.npy", np.random.default_rng(0).normal(size=(200, 3)) * 40)
     scene = load_scene()
-    np.save(place / "depth.npy", scene.image.depth.numpy())
+    np.save(place / "depth.npy", halved(scene.image.depth).numpy())
     np.save(place / "pose.npy", scene.image.obj_from_camera.numpy())
     (place / "out_of_it").symlink_to(DATA)
     return place
@@ -79,8 +82,8 @@ def folder(tmp_path_factory):
 def said(folder):
     """What a client hears by stdio: the calls by name, then the tools."""
     scene = load_scene()
-    row, column = np.argwhere(scene.pixel_labels.numpy() == 2).mean(0).tolist()
-    k = scene.image.intrinsics
+    row, column = np.argwhere(halved(scene.pixel_labels).numpy() == THING).mean(0).tolist()
+    k = scene.image.intrinsics / 2  # of the half image
     camera = [float(x) for x in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])]
     grasps = {"grasps": "out/tin/grasps.safetensors"}
     depth = {"depth": "depth.npy", "intrinsics": camera, "camera_pose": "pose.npy"}
@@ -195,7 +198,7 @@ def test_a_depth_image_and_a_mesh_are_planned_on_and_an_empty_plan_is_explained(
         plan = said[call]["data"]
         assert plan["executable"] > 0 and (folder / plan["seen_file"]).is_file(), plan["verdict"]
     scene = load_scene()
-    middle = scene.points[scene.rows_of(2)].double().mean(0).numpy()
+    middle = scene.points[scene.rows_of(THING)].double().mean(0).numpy()
     for row in said["depth"]["data"]["grasps"]:  # the hand is at the object of the pixel
         assert np.linalg.norm(row["position"] - middle) < 0.35
     told = said["explain"]["data"]
