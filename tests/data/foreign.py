@@ -1,4 +1,4 @@
-"""Reads data sets as others do: python foreign.py tables|episodes FOLDER OUT, in the environment
+"""Reads data sets as others do: python foreign.py tables|episodes OUT FOLDERS, in the environment
 .beside/lerobot.
 
 What is read goes to OUT as JSON, so that the caller, which has none of these packages, can compare
@@ -95,6 +95,6 @@ def plain(value: object) -> object:
 
 if __name__ == "__main__":
     assert os.environ["HF_HUB_OFFLINE"] == "1"
-    Path(sys.argv[3]).write_text(
-        json.dumps({"tables": tables, "episodes": episodes}[sys.argv[1]](sys.argv[2]))
-    )
+    kind, out, *folders = sys.argv[1:]
+    read = {"tables": tables, "episodes": episodes}[kind]
+    Path(out).write_text(json.dumps([read(folder) for folder in folders]))

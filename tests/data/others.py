@@ -12,8 +12,10 @@ ROOT = Path(__file__).parents[2]
 PYTHON = ROOT / ".beside" / "lerobot" / "bin" / "python"
 
 
-def read_foreign(kind: str, folder: Path, tmp_path: Path) -> dict[str, Any]:
-    """Return what other libraries read in a folder, without a network and with an empty cache."""
+def read_foreign(kind: str, folders: list[Path], tmp_path: Path) -> list[dict[str, Any]]:
+    """Return what other libraries read in each folder, without a network and with an empty cache:
+    they are loaded once.
+    """
     if not PYTHON.exists():
         pytest.skip("scripts/beside lerobot makes the environment of the readers")
     out = tmp_path / "read.json"
@@ -22,8 +24,8 @@ def read_foreign(kind: str, folder: Path, tmp_path: Path) -> dict[str, Any]:
         str(PYTHON),
         str(Path(__file__).with_name("foreign.py")),
         kind,
-        str(folder),
         str(out),
+        *map(str, folders),
     ]
     done = subprocess.run(
         command, env=os.environ | cache | {"PYTHONPATH": ""}, capture_output=True, text=True

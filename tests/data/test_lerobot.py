@@ -70,7 +70,8 @@ def test_lerobot_reads_episodes_with_joints_by_name(
 ):
     episodes = [("lift the jug", closing), ("let the jug fall", slipped), ("lift the jug", closing)]
     hand = load_hand("allegro")
-    found = read_foreign("episodes", write_lerobot(tmp_path / "data", episodes, hand), tmp_path)
+    written = write_lerobot(tmp_path / "data", episodes, hand)
+    (found,) = read_foreign("episodes", [written], tmp_path)
     assert (found["fps"], found["robot"], found["episodes"]) == (100, "allegro", 3)
     counts = [len(x.time) - 1 for _, x in episodes]
     assert found["rows"] == len(found["tasks"]) == sum(counts)

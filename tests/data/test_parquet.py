@@ -44,6 +44,12 @@ def written(shards: GraspShards, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return write_parquet(shards, tmp_path_factory.mktemp("parquet") / "data")
 
 
+@pytest.fixture(scope="module")
+def foreign(written: Path, tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    """What Hugging Face and Croissant read offline, in the written folder and in the sample."""
+    return read_foreign("tables", [written, SAMPLE], tmp_path_factory.mktemp("foreign"))
+
+
 def rows(folder: Path, name: str) -> dict[str, list[Any]]:
     return parquet.read_table(folder / name).to_pydict()
 
@@ -105,9 +111,9 @@ def test_arrow_reads_what_the_reader_reads(shards: GraspShards, written: Path):
 
 
 def test_hugging_face_and_croissant_read_it_offline(
-    shards: GraspShards, written: Path, tmp_path: Path
+    shards: GraspShards, foreign: list[dict[str, Any]]
 ):
-    found = read_foreign("tables", written, tmp_path)
+    found = foreign[0]
     check_rows(shards, found["grasps.rows"])
     check_views(shards, found["views.rows"])
     types = found["grasps.types"]
@@ -120,12 +126,12 @@ def test_hugging_face_and_croissant_read_it_offline(
     check_views(shards, found["views.records"])
 
 
-def test_the_shipped_sample_loads_in_one_line(tmp_path: Path):
+def test_the_shipped_sample_loads_in_one_line(foreign: list[dict[str, Any]]):
     """A thousand grasps in at most 5 MB, tried in simulation; their numbers fit the hand and each
     other.
     """
     assert sum(x.stat().st_size for x in SAMPLE.rglob("*") if x.is_file()) <= 5e6
-    found = read_foreign("tables", SAMPLE, tmp_path)
+    found = foreign[1]
     grasps = found["grasps.rows"]
     assert len(grasps["grasp"]) == 1000 and grasps == found["grasps.records"]
     passed = [tries == ["OK"] for tries in grasps["outcomes"]]
