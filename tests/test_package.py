@@ -49,8 +49,68 @@ OF_URDF = SLOW - {"skimage", "sklearn"} | {"PIL"}
 """What yourdfpy and the used modules of pytorch-kinematics import."""
 
 
-MODULES = "import sys; print(*sys.modules)"
-"""Code that prints what is imported."""
+IMPORTS = """
+import contextlib, logging, os, random, sys, warnings
+import numpy as np, torch
+
+def state():
+    return (torch.get_default_dtype(), torch.get_num_threads(), torch.is_grad_enabled(), torch.get_default_device(),
+            torch.are_deterministic_algorithms_enabled(), torch.get_float32_matmul_precision(), torch.get_rng_state(),
+            np.random.get_state()[1], random.getstate(), np.geterr(), dict(os.environ), logging.root.handlers[:],
+            logging.root.level, os.getcwd())
+
+def apart(act, *given):
+    if child := os.fork():
+        assert os.waitpid(child, 0)[1] == 0
+        return
+    act(*given)
+    os._exit(0)
+
+def ask_for_help():
+    from torchgrasp.app import cli
+    with contextlib.suppress(SystemExit):
+        cli.main(["--help"])
+    print("help:", *sys.modules)
+
+def load_hands():
+    hand = [torchgrasp.load_hand(name) for name in ("allegro", "shadow", "barrett")][-1]
+    print("hand:", *sys.modules)
+    for words in ("*", "build_chain_from_mjcf"):
+        apart(import_kinematics, hand, words)
+
+def import_kinematics(hand, words):
+    names = {}
+    exec(f"from pytorch_kinematics import {words}", names)
+    import pytorch_kinematics as kinematics
+    assert isinstance(hand.chain, kinematics.Chain) and kinematics.PseudoInverseIK
+    print("kinematics:", names["build_chain_from_mjcf"].__module__, type(kinematics).__name__)
+
+before = state()
+import torchgrasp
+for a, b in zip(before, state(), strict=True):
+    same = a == b
+    assert same if isinstance(same, bool) else bool(same.all()), (a, b)
+print("import:", *sys.modules)
+print("files:", *os.listdir())
+apart(ask_for_help)
+apart(load_hands)
+"""
+"""Tells what is imported after each step, each in a copy of the process that has imported the library."""
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+    """What `IMPORTS` tells in an empty folder, by the words before the colons."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("empty"))
+        done = run_python("-u", "-c", IMPORTS)
+    assert done.returncode == 0, done.stderr
+    told = dict[str, list[str]]()
+    for line in done.stdout.splitlines():
+        name, colon, said = line.partition(":")
+        if colon:
+            told.setdefault(name, []).append(said)
+    return told
 
 
 def assert_light(modules: str, needed: frozenset[str] = frozenset()) -> None:
@@ -61,58 +121,31 @@ def assert_light(modules: str, needed: frozenset[str] = frozenset()) -> None:
 
 
 @pytest.mark.promise("F9")
-def test_help_brings_in_nothing_that_simulates_draws_or_is_slow_to_import():
+def test_help_brings_in_nothing_that_simulates_draws_or_is_slow_to_import(
+    imported: dict[str, list[str]],
+):
     """Nor does it bring in the tools of agents."""
-    code = "import torchgrasp.app.cli as cli\ntry: cli.main(['--help'])\nexcept SystemExit: pass\n"
-    modules = run_python("-c", code + MODULES).stdout.splitlines()[-1]
+    (modules,) = imported["help"]
     assert_light(modules)
     assert "torchgrasp.app.cli" in modules.split() and ".agent_" not in modules
 
 
 @pytest.mark.promise("F9")
-def test_a_hand_brings_in_little_and_leaves_the_whole_pytorch_kinematics_to_its_caller():
-    """Each way of importing is tried in a copy of the process, after the hands are loaded."""
-    code = f"""
-import os, torchgrasp
-hand = [torchgrasp.load_hand(name) for name in ("allegro", "shadow", "barrett")][-1]
-{MODULES}
-for words in ("*", "build_chain_from_mjcf"):
-    if child := os.fork():
-        assert os.waitpid(child, 0)[1] == 0
-        continue
-    exec(f"from pytorch_kinematics import {{words}}")
-    import pytorch_kinematics as kinematics
-    assert isinstance(hand.chain, kinematics.Chain) and kinematics.PseudoInverseIK
-    print(build_chain_from_mjcf.__module__, type(kinematics).__name__, flush=True)
-    os._exit(0)
-"""
-    found = run_python("-u", "-c", code)
-    modules, *told = found.stdout.splitlines()
+def test_a_hand_brings_in_little_and_leaves_the_whole_pytorch_kinematics_to_its_caller(
+    imported: dict[str, list[str]],
+):
+    """Each way of importing is tried after the hands are loaded."""
+    (modules,) = imported["hand"]
     assert_light(modules, frozenset(OF_URDF))
-    assert told == ["pytorch_kinematics.mjcf module"] * 2, found.stderr
+    assert imported["kinematics"] == [" pytorch_kinematics.mjcf module"] * 2
 
 
 @pytest.mark.promise("F9")
-def test_import_is_light_changes_no_global_state_and_writes_no_file(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    code = """
-import logging, os, random, warnings
-import numpy as np, torch
-def state():
-    return (torch.get_default_dtype(), torch.get_num_threads(), torch.is_grad_enabled(), torch.get_default_device(),
-            torch.are_deterministic_algorithms_enabled(), torch.get_float32_matmul_precision(), torch.get_rng_state(),
-            np.random.get_state()[1], random.getstate(), np.geterr(), dict(os.environ), logging.root.handlers[:],
-            logging.root.level, os.getcwd())
-before = state()
-import torchgrasp
-for a, b in zip(before, state(), strict=True):
-    same = a == b
-    assert same if isinstance(same, bool) else bool(same.all()), (a, b)
-print("same")
-"""
-    found = run_python("-c", code + MODULES)
-    same, modules = found.stdout.splitlines()
-    assert same == "same" and list(tmp_path.iterdir()) == [], found.stderr
+def test_import_is_light_changes_no_global_state_and_writes_no_file(
+    imported: dict[str, list[str]],
+):
+    (modules,) = imported["import"]
+    assert imported["files"] == [""]
     assert_light(modules)
 
 
