@@ -39,7 +39,7 @@ CASES = (
     ("cylinder", "allegro", 0.25),
 )
 """Objects, hands and masses [kg] whose shipped grasps are played: the first is too heavy."""
-SPEC = TrialSpec(approach=0.05, hold_time=0.3)
+SPEC = TrialSpec(approach=0.05, hold_time=0.1)
 LIBRARIES = {
     "mujoco": {"mujoco", "numpy"},
     "maniskill": {"gymnasium", "environment", "numpy"},
