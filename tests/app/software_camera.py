@@ -47,7 +47,7 @@ class Camera:
         self.device.register_info(rs.camera_info.name, "Software RealSense")
         self.device.register_info(rs.camera_info.serial_number, serial)
         self.sensor = self.device.add_sensor("Stereo Module")
-        k = INTRINSICS.tolist()
+        k = (INTRINSICS / 2).tolist()  # of every second pixel
         pixels = rs.intrinsics()
         pixels.width = width
         pixels.height = height
@@ -77,7 +77,7 @@ class Camera:
             frame = rs.software_video_frame()
             shown = self.counts * (number >= DARK)
             if self.moves:
-                shown = np.roll(shown, 20 * number, axis=1)
+                shown = np.roll(shown, 10 * number, axis=1)
             frame.pixels = np.ascontiguousarray(shown, dtype=np.uint16)
             frame.bpp = 2
             frame.stride = 2 * shown.shape[1]
