@@ -28,8 +28,18 @@ from torchgrasp.sim.mujoco_scene import (
 from torchgrasp.sim.scene_spec import SceneSpec
 from torchgrasp.values.closing import ClosureResult
 
-TRIAL = TrialSpec(mass=0.249, table_friction=0.2, lift_height=0.1, approach=0.1, simulator="mujoco")
-"""A lift as of protocol "table-lift", by as much as the planner checks the way of the arm."""
+TRIAL = TrialSpec(
+    mass=0.249,
+    table_friction=0.2,
+    lift_height=0.1,
+    approach=0.1,
+    hold_time=0.3,
+    control_rate=50.0,
+    simulator="mujoco",
+)
+"""A lift as of protocol "table-lift", by as much as the planner checks the way of the arm; it is
+held for a shorter time.
+"""
 DRIVES = {150.0: (2000.0, 400.0), 28.0: (500.0, 100.0)}
 """Stiffness [N m/rad] and damping [N m s/rad] of the UR5e's joints by their effort [N m], of MuJoCo
 Menagerie.
