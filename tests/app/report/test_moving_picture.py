@@ -1,6 +1,7 @@
 """Films of a closing: what is seen rises as in the record, and lasts as long."""
 
 import dataclasses
+import functools
 import itertools
 import subprocess
 import sys
@@ -11,6 +12,8 @@ import torch
 from PIL import Image, ImageSequence
 
 from tests.make import ROOT
+from tests.pinch import QUICK
+from torchgrasp import TrialSpec
 from torchgrasp.app.report.canvas import OBJECT, rgb
 from torchgrasp.app.report.moving_picture import MOVIE, write_film
 from torchgrasp.data.shipped import DATA, load_shipped_grasp
@@ -107,7 +110,9 @@ def test_what_is_no_film_is_refused(run, tmp_path):
 
 
 @pytest.mark.sim
-def test_the_command_closes_the_hand_and_writes_a_gif(run_command, tmp_path):
+def test_the_command_closes_the_hand_and_writes_a_gif(run_command, tmp_path, monkeypatch):
+    quick = functools.partial(TrialSpec, hold_time=QUICK.hold_time, control_rate=QUICK.control_rate)
+    monkeypatch.setattr("torchgrasp.app.cli.filming.TrialSpec", quick)
     load_shipped_grasp("jug", "barrett").save(tmp_path / "grasps.safetensors")
     out = tmp_path / "lift.gif"
     mesh = DATA / "jug" / "mesh.ply"
