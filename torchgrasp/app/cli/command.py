@@ -95,7 +95,8 @@ def _annotate(field: dataclasses.Field) -> Any:
     shown.
     """
     if field.metadata.get("nested"):
-        return Annotated[field.type, tyro.conf.arg(name="")]
+        # without a text, tyro would read the source of the command for one
+        return Annotated[field.type, tyro.conf.arg(name="", help="")]
     text = field.metadata["help"]
     if field.metadata.get("positional"):
         hint = "" if field.default is None else None
