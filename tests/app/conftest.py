@@ -1,15 +1,31 @@
 """Ways to run the command line in tests."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterator
 
 import pytest
 
 from torchgrasp.app import cli
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import hands_folder, load_hand
+
+SHIPPED = {path.name for path in hands_folder().iterdir()}
+read_once = functools.cache(load_hand)
+
+
+def load_shipped_once(hand: str, fingers: str = "default") -> Hand:
+    """Return a hand; a shipped one is read once for all commands."""
+    return (read_once if hand in SHIPPED else load_hand)(hand, fingers)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def plans_once(kept_plans: None) -> None:
-    """Estimate the shape of each object, and plan for each request, once for all commands."""
+def plans_once(kept_plans: None) -> Iterator[None]:
+    """Estimate the shape of each object, plan for each request, and read each shipped hand once for
+    all commands.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torchgrasp.app.cli.inputs.load_hand", load_shipped_once)
+        yield
 
 
 @pytest.fixture
