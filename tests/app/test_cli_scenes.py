@@ -217,9 +217,9 @@ def test_planes_are_searched_once_at_most(
 ):
     calls = []
 
-    def count(*arguments):
+    def count(*arguments, **options):
         calls.append(arguments)
-        return find_supports(*arguments)
+        return find_supports(*arguments, **options)
 
     monkeypatch.setattr("torchgrasp.geometry.support_planes.find_supports", count)
     bare = {name: seen[name] for name in ("depth", "intrinsics", "camera_pose")}

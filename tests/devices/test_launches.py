@@ -17,10 +17,11 @@ from torchgrasp.values.planning import PointCloud
 
 KNOWN = {
     "outside": "",
-    "cloud/agreement.py": "noise_of check_foot",
+    "cloud/agreement.py": "noise_of check_foot warn_of_low_table",
     "cloud/check.py": "_check _check_distinct _distinct_rows first_of_each",
     "cloud/neighbours.py": "_fit_block _principal_axes is_flat nearest",
     "cloud/prepare.py": "_fit_normals prepare_cloud share_facing",
+    "cloud/viewpoint.py": "share_unseen",
     "geometry/frames.py": "virtual_frame",
     "geometry/linalg.py": "cholesky farthest_points number_rows",
     "geometry/optim.py": "levenberg_marquardt",

@@ -26,9 +26,9 @@ HAND = "leap"  # whose URDF has another order of joints than the driver
 NAMES = bags.ROOT / "examples/ros2/drivers/leap.json"
 CAMERA = rigid(
     torch.tensor(Rotation.from_euler("xyz", [-2.2, 0.2, 1.0]).as_matrix()),
-    torch.tensor([0.3, -0.4, 0.5]).double(),
+    load_object("cylinder").view.viewpoint,
 )
-"""Pose of the camera in the frame of gravity."""
+"""Pose of the camera in the frame of gravity: it is where it saw the cylinder."""
 
 
 def seen():

@@ -194,8 +194,9 @@ def warn_of_low_table(cloud: PointCloud, table: Plane) -> None:
     Such an object is in the air, as without a table: the space that its points hide reaches no
     farther. The table is in the frame of the cloud.
     """
-    foot = float(table.height(cloud.points.double().cpu()).quantile(AGREEMENT.lowest))
-    if foot > float(norm(cloud.points.amax(0) - cloud.points.amin(0))):
+    points = cloud.points.double().cpu()
+    foot = float(table.height(points).quantile(AGREEMENT.lowest))
+    if foot > float(norm(points.amax(0) - points.amin(0))):
         found = f"it is {1e3 * foot:.0f} mm below the object's points, more than their extent"
         fix = "expected the table's height in metres, or None (--no-table) for an object in the air"
         warn_user(NoEffect, f"table changes nothing: {found}; {fix}")

@@ -199,6 +199,7 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
     The second share is 1 if a point lies behind the camera at `viewpoint` (3,) [m]. `points` are
     (n, 3) [m]; `normals` (n, 3) are unit vectors of either sign.
     """
+    points, normals, viewpoint = (x.cpu() for x in (points, normals, viewpoint))
     ray = unit(points - viewpoint)
     edge_on = float(((ray * normals).sum(-1).abs() < UNSEEN.grazing).double().mean())
     middle = (points.amax(0) + points.amin(0)) / 2
@@ -208,11 +209,11 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
     axes = torch.linalg.svd(unit(forward)[None]).Vh  # forward, or backward, and two axes across
     local = (points - viewpoint) @ axes.T
     depth = local[:, 0].abs()
-    pixels = (local[:, 1:] / depth[:, None]).cpu().numpy()
+    pixels = (local[:, 1:] / depth[:, None]).numpy()
     apart, index = spatial.KDTree(pixels).query(pixels, k=min(UNSEEN.neighbours, len(pixels)))
 
     # A point lies behind a neighbour if it is deeper by more than a slope explains.
-    step = (depth[:, None] - depth[torch.from_numpy(index).to(depth.device)]).abs()
+    step = (depth[:, None] - depth[torch.from_numpy(index)]).abs()
     step = step - UNSEEN.slope * torch.from_numpy(apart).to(depth) * depth[:, None]
     radius = torch.linalg.vector_norm(points - middle, dim=-1).max()
     return edge_on, float((step.amax(1) > UNSEEN.step * radius).double().mean())
