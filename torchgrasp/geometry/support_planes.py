@@ -58,7 +58,7 @@ class SupportNumbers:
     """Least cosine between the normal and the image's downward direction of a plane that an upright
     camera cannot see from above: a wall faces a camera that looks down so.
     """
-    upside_down: float = 0.5
+    upside_down: float = 0.25
     """Factor on the score of such a plane: few cameras are upside down."""
     plausible: float = 0.2
     """Least score of a support at an angle to the best one, over the best: a wall has less."""
@@ -315,8 +315,8 @@ def find_supports(
     Triples of points propose planes. An iterated fit with Tukey's weights refines each plane.
     Objects stand on a support, over its region, and the camera sees nothing through the region. The
     support with the most points low above it comes first. The points count twice if the camera
-    looks at the support, and half if it is bowed. They count half if the camera would have to be
-    upside down to see the support from above. Those on a wall beside it count a quarter. Walls
+    looks at the support, and half if it is bowed. They count a quarter if the camera would have to
+    be upside down to see the support from above, or if they are on a wall beside it. Walls
     beside the first support, on which far fewer points stand, are left out. Of parallel supports, a
     higher one as wide as furniture comes first. A
     rigid motion of all arguments moves the supports alike.
