@@ -43,7 +43,7 @@ MASS = 0.1
 """Mass of objects that are not the library's own [kg]: a light household object."""
 
 CELL_SECONDS = 3600.0
-"""Wall time [s] after which an object is given up: many times the usual."""
+"""CPU time [s] after which an object is given up: many times the usual."""
 
 
 def run_cells(spec: TableSpec, rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]]:

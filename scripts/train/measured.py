@@ -25,7 +25,7 @@ from torchgrasp.values.planning import Grasps, PointCloud
 from train.trials import BEST, SPREAD, Trial, read_rows
 
 LIMIT = 7200.0
-"""Wall time [s] in which the grasps of one data set are measured."""
+"""CPU time [s] in which the grasps of one data set are measured."""
 
 
 class Trials(NamedTuple):

@@ -85,7 +85,7 @@ KEPT = 0.2
 """Share of the bodies whose contacts are planned in one half of their view, as at a handle."""
 
 LIMIT = 1800.0
-"""Wall time [s] of one job."""
+"""Limit [s] of the CPU time of one job."""
 
 
 ABOUT = """---

@@ -164,3 +164,19 @@ def test_of_a_floor_and_a_wall_that_are_alike_the_cameras_upward_side_tells_whic
     lower = [corner[0], box([0.02, 0.8, 0.4], [-0.01, 0.0, 0.2])]
     found = find_supports(*look([*lower, *things], None, pose), image_up=image_up)
     assert len(found) == 1 and float(found[0].plane.normal @ UP) > 0.999
+
+
+@pytest.mark.parametrize("radius", [0.14, 0.16])
+def test_a_small_bowed_table_above_a_floor_supports(radius):
+    """Its top is a cap of a ball, 20 mm high; a plane through it is within that."""
+    sag = 0.02
+    ball = (radius**2 + sag**2) / (2 * sag)
+    top = trimesh.creation.icosphere(subdivisions=6, radius=ball).apply_translation([0, 0, -ball])
+    top = trimesh.intersections.slice_mesh_plane(top, [0, 0, 1], [0, 0, -sag])
+    things = [
+        box([0.04, 0.04, 0.06], [0.03, 0.02, 0.028]),
+        trimesh.creation.cylinder(0.02, 0.08).apply_translation([-0.04, -0.03, 0.038]),
+    ]
+    floor = box([2.0, 2.0, 0.02], [0.0, 0.0, -0.36])
+    first = find_supports(*look([top, *things, floor], None, look_at(20.0, 50.0, 0.7)))[0]
+    assert first.local and -sag < first.plane.offset < 0.0 and first.plane.normal[2] > 0.99

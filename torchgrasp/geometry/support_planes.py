@@ -588,8 +588,10 @@ class _FlatSurface:
         """Return whether this surface is at an angle to another one, as a wall to a table."""
         return abs(float(self.fit.normal @ other.fit.normal)) < SUPPORTS.askew
 
-    def parallel(self, other: "_FlatSurface") -> bool:
-        """Return whether another surface is parallel to this one, flat, and as wide as furniture."""
+    def level_with(self, other: "_FlatSurface") -> bool:
+        """Return whether this surface is parallel to another one that is flat, and as wide as
+        furniture.
+        """
         cosine = abs(float(self.fit.normal @ other.fit.normal))
         return cosine > SUPPORTS.parallel and not other.bowed and other.width > SUPPORTS.furniture
 
@@ -609,7 +611,7 @@ def _judge(
     support = surface.support
     wide = least_width
     if surface.bowed:
-        level = any(surface.parallel(other) for other in surfaces if other is not surface)
+        level = any(surface.level_with(other) for other in surfaces if other is not surface)
         wide = SUPPORTS.small_table if level else SUPPORTS.furniture
     reason = _refuse_plane(view, surface)
     if reason:

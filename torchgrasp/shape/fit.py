@@ -194,7 +194,8 @@ def fit_upright(
     noise = options.noise
     up = None if table is None else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32, device="cpu")
     seen = prepare_cloud(cloud, generator, clean=options.support == "camera", up=up)
-    # the camera of a depth image is known, an estimated one is a guess, a whole surface has none
+    # The camera of a depth image is known, an estimated one is a guess, a whole surface has none.
+    # It is judged after the outline, which refuses a camera within the points by that name.
     judged = seen.one_sided and not in_image and not seen.estimated
     view = PointCloud(seen.points, seen.normals, seen.viewpoint, seen.frustum)
     if options.support == "paper":

@@ -46,7 +46,7 @@ EDGE = 1 - 1e-9
 """Share of the largest distance from the centre at which a shape is asked."""
 
 LIMIT = 600.0
-"""Wall time [s] of one view."""
+"""Limit [s] of the CPU time of one view."""
 
 
 @bench("headline/rendered", objects=True)

@@ -56,8 +56,8 @@ LOW = 0.05
 """The quantile of the friction at which the most careful rule plans."""
 GAIN = 0.03
 """Share of lifts by which knowing the distribution must beat knowing its mean."""
-LIMIT = 3600.0
-"""Wall time [s] of one body."""
+LIMIT = 1800.0
+"""Limit [s] of the CPU time of one body."""
 MEAN, HALF, LOWEST = "at the mean", "at half of the mean", "at the 5 % quantile"
 """Names of the rules; the second one is the default."""
 NUMBER = "at half of the mean, told the mean alone"

@@ -24,6 +24,8 @@ from torchgrasp.geometry.plane import Plane
 
 VARIANTS = 6
 """Variants of each frame."""
+VERTICAL = 45.0
+"""Angle [deg] to the true normal above which a plane counts as vertical."""
 ROLL = 12.0
 CUT = 0.12
 NOISE = 0.002
@@ -147,7 +149,7 @@ def judge_variant(folder: Path, name: str, frame: dict[str, Any], seed: list[int
     right = [angle < degrees and error < mm for angle, error in errors]
     if any(right):
         return "right" if right[0] else "offered"
-    return "vertical" if errors[0][0] > 45 else "wrong"
+    return "vertical" if errors[0][0] > VERTICAL else "wrong"
 
 
 def vary(

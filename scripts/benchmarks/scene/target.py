@@ -65,7 +65,7 @@ HIDDEN = (0.0, 1 / 3, 2 / 3, 1.0)
 WAYS = ("mask", "click")
 BARS = {"mask": 0.96, "click": 0.93}
 LIMIT = 1800.0
-"""Wall time [s] of one scene."""
+"""Limit [s] of the CPU time of one scene."""
 
 
 @dataclasses.dataclass(frozen=True)
