@@ -1,0 +1,190 @@
+"""Postures in which a hand presses on a surface from above, with the tips of one or two fingers.
+
+All other links are farther from the surface than the pressing tips. So the hand can be set down on
+a low object without touching its table, and slide the object along.
+"""
+
+import dataclasses
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.foundation.base import Value, flatnonzero
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.rules import Seed
+from torchgrasp.geometry.frames import rigid
+from torchgrasp.geometry.linalg import across, fibonacci_sphere
+from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.seeds import PostureLibrary
+
+
+@dataclasses.dataclass(frozen=True)
+class PressNumbers:
+    """Parameters of the search for pressing postures."""
+
+    postures: int = 1000
+    """Number of random postures of the hand that are tried."""
+    directions: int = 400
+    """Number of directions, over the whole sphere, in which each posture is tried as pressing."""
+    level: float = 0.003
+    """Largest difference [m] of the heights of two pressing tips: joints give way by as much."""
+    gap: float = 0.006
+    """Least distance [m] by which all other links are higher than the pressing tips."""
+    cosine: float = 0.5
+    """Least cosine between a pad's axis and the direction of pressing: its cone has 60 degrees."""
+    apart: float = 0.02
+    """Least distance [m] of two pressing tips, so that they resist a turn of the object."""
+    weakest: float = 5.0
+    """Least normal force [N] of a pressing finger: a quarter of a kilogram slides with it."""
+    strongest: float = 60.0
+    """Greatest one: a stretched finger does not give way, and its force is hard to control."""
+    kept: int = 200
+    """Number of postures that are kept."""
+
+
+PRESS = PressNumbers()
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class PressPostures(Value):
+    """Pressing postures of a hand: first those of two tips, each kind by falling gap.
+
+    The gap is the distance by which all other links are higher than the pressing tips.
+
+    p counts postures, h actuated joints, f fingertips and s collision spheres. Each posture has a
+    frame with the origin at the mean of the pressing tips' lowest points. Its z axis points up,
+    against the direction of pressing.
+
+    Attributes:
+        joints: actuated joints (p, h) [rad or m].
+        press_from_hand: pose (p, 4, 4) [m] of the hand's root link in the posture's frame.
+        presses: mask (p, f) of the fingers that press.
+        feet: lowest points (p, f, 3) [m] of the fingertips in the posture's frame.
+        strength: greatest normal force (p,) [N] of the weakest pressing finger, by the torques of
+            its joints.
+        spheres: centres (p, s, 3) [m] of the hand's collision spheres in the posture's frame.
+    """
+
+    joints: Float[Tensor, "p h"]
+    press_from_hand: Float[Tensor, "p 4 4"]
+    presses: Bool[Tensor, "p f"]
+    feet: Float[Tensor, "p f 3"]
+    strength: Float[Tensor, "p"]
+    spheres: Float[Tensor, "p s 3"]
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+
+@checked
+def press_postures(hand: Hand, seed: Seed = 0) -> PressPostures:
+    """Return the pressing postures of a hand, found among random postures drawn from `seed`.
+
+    At most 200 (`PRESS.kept`) are returned, and none if no posture presses. The result is cached
+    in `hand.derived`.
+
+    >>> from torchgrasp import load_hand
+    >>> found = press_postures(load_hand("allegro"))
+    >>> bool(found.presses.any(1).all()), bool((found.strength > 1.0).any())
+    (True, True)
+    """
+    key = (PressPostures, seed)
+    if key not in hand.derived:
+        hand.derived[key] = _search(hand, seed)
+    return hand.derived[key]
+
+
+def _search(hand: Hand, seed: int) -> PressPostures:
+    """Return the pressing postures; each random posture gives at most one, in its best direction."""
+    library = PostureLibrary.of(hand, seed=seed)
+    joints = library.joints[: PRESS.postures]
+    centres = hand.tip_centres(joints)
+    radius = hand.tips.radius.to(centres)
+    _, pads = hand.fingertips(joints)
+    spheres = hand.sphere_centres(joints)
+    around = hand.collision_spheres
+    directions = fibonacci_sphere(PRESS.directions).to(centres)
+    # how far everything reaches in each direction: (s, d, f) and (s, d)
+    reach = directions @ centres.mT + radius
+    links = (directions @ spheres[:, ~around.touching].mT + around.radius[~around.touching]).amax(2)
+    facing = directions @ pads.mT > PRESS.cosine
+    presses = facing & (reach > reach.amax(2, keepdim=True) - PRESS.level)
+    presses &= presses.sum(2, keepdim=True) <= 2
+    lowest = torch.where(presses, reach, math.inf).amin(2)
+    others = torch.where(presses, -math.inf, reach).amax(2)
+    gap = lowest - torch.maximum(links, others)
+    apart = _apart(centres, presses)
+    good = presses.any(2) & (gap > PRESS.gap) & (apart > PRESS.apart)
+    # two tips resist a turn, so they come before one; then the wider gap
+    value = torch.where(good, gap + presses.sum(2), -math.inf)
+    best, at = value.max(1)
+    row = flatnonzero(best > -math.inf)
+    row = row[torch.argsort(best[row], descending=True, stable=True)]
+    at = at[row]
+    return _built(hand, joints[row], directions[at], presses[row, at])
+
+
+def _apart(
+    centres: Float[Tensor, "s f 3"], presses: Bool[Tensor, "s d f"]
+) -> Float[Tensor, "s d"]:
+    """Return the least distance [m] of two pressing tips; infinite for one tip."""
+    gaps = torch.cdist(centres, centres)  # (s, f, f)
+    both = presses[..., :, None] & presses[..., None, :]
+    both &= ~torch.eye(centres.shape[1], dtype=torch.bool, device=centres.device)
+    return torch.where(both, gaps[:, None], math.inf).flatten(2).amin(2)
+
+
+def _built(
+    hand: Hand,
+    joints: Float[Tensor, "p h"],
+    down: Float[Tensor, "p 3"],
+    presses: Bool[Tensor, "p f"],
+) -> PressPostures:
+    """Return the postures that press in the directions `down` of the hand's frame, in their order.
+
+    Those that are too weak or too stiff are left out.
+    """
+    centres = hand.tip_centres(joints)
+    feet = centres + hand.tips.radius.to(centres)[:, None] * down[:, None]
+    strength = _strength(hand, joints, feet, down, presses)
+    fit = (strength >= PRESS.weakest) & (strength <= PRESS.strongest)
+    fit = flatnonzero(fit)[: PRESS.kept]
+    joints, down, presses, feet, strength = (
+        x[fit] for x in (joints, down, presses, feet, strength)
+    )
+    share = presses.to(feet) / presses.sum(1, keepdim=True)
+    origin = (share[..., None] * feet).sum(1)
+    first, second = across(down)
+    press_from_hand = torch.linalg.inv(rigid(torch.stack([second, first, -down], -1), origin))
+    turn = press_from_hand[:, :3, :3]
+    shift = press_from_hand[:, None, :3, 3]
+    spheres = hand.sphere_centres(joints)
+    return PressPostures(
+        joints,
+        press_from_hand,
+        presses,
+        feet @ turn.mT + shift,
+        strength,
+        spheres @ turn.mT + shift,
+    )
+
+
+def _strength(
+    hand: Hand,
+    joints: Float[Tensor, "p h"],
+    feet: Float[Tensor, "p f 3"],
+    down: Float[Tensor, "p 3"],
+    presses: Bool[Tensor, "p f"],
+) -> Float[Tensor, "p"]:
+    """Return the greatest normal force [N] of the weakest pressing finger of each posture.
+
+    A force F along `down` at a tip with the Jacobian J needs the torques J^T F (statics).
+    """
+    jacobian = hand.jacobian(joints, feet)  # (p, f, 3, h)
+    torque = (down[:, None, None] @ jacobian)[:, :, 0].abs()  # (p, f, h) for 1 N
+    effort = torque.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
+    most = (effort / torque.clamp_min(torch.finfo(torque.dtype).tiny)).amin(2)
+    return torch.where(presses, most, math.inf).amin(1)

@@ -1,0 +1,338 @@
+"""Grasps of a low object at the edge of its table: the hand slides it there, then grasps what hangs
+over.
+
+A fingertip cannot reach below an object that lies flat. So the hand presses on it from above, and
+slides it until a part hangs over the edge, while its centre of mass stays above the table. The
+fingers then pinch this part from above and below.
+"""
+
+import dataclasses
+import math
+from typing import Annotated
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.data.accept import SeenLike, as_seen
+from torchgrasp.foundation.base import Value, flatnonzero
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Count, Pose, Range, Seed
+from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.geometry.frames import apply, inverse, rigid
+from torchgrasp.geometry.plane import Plane, move
+from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.press import PressPostures, press_postures
+from torchgrasp.planner.objects import ShapedObject
+from torchgrasp.planner.request import Request
+from torchgrasp.planner.run import plan_shaped
+from torchgrasp.success.task import GraspTask
+from torchgrasp.values.distribution import Distribution
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import ContactSpec
+
+GRAVITY = 9.81  # acceleration [m/s^2]
+
+
+@dataclasses.dataclass(frozen=True)
+class SlideNumbers:
+    """Parameters of a slide to the edge."""
+
+    behind: float = 0.012
+    """Distance [m] behind the edge at which the centre of mass ends: its estimate is 5 mm off."""
+    supported: float = 0.004
+    """Least distance [m] behind the edge of each pressing tip at the end of the slide."""
+    back: tuple[float, ...] = (0.0, 0.01, 0.02)
+    """Distances [m] behind the centre of mass at which the tips may press."""
+    turns: int = 36
+    """Number of directions about the vertical in which each posture is tried."""
+    upward: float = 0.9
+    """Least upward part of the unit normal where a tip presses: 25 degrees."""
+    rim: float = 0.002
+    """Distance [m] of a pressing tip from the object's outline."""
+    ring: int = 8
+    """Number of points on the circle of radius `rim` that must lie on the object's top."""
+    flat: float = 0.003
+    """Largest difference [m] of heights on this circle."""
+    near: float = 0.0025
+    """Largest horizontal distance [m] of a point on the top from a vertex of it."""
+    clear: float = 0.003
+    """Least clearance [m] of all other links from the object and the table."""
+    lowered: int = 6
+    """Number of heights at which the hand is checked on its way down."""
+    approach: float = 0.05
+    """Height [m] from which the hand comes down."""
+    reserve: float = 3.0
+    """Ratio of the pressing force to the least one that moves the object."""
+    most: float = 20.0
+    """Greatest pressing force [N]: thin things bend, and hands are weak."""
+    shortest: float = 0.002
+    """Length [m] of a slide that is not worth while: sensors are off by as much."""
+
+
+SLIDE = SlideNumbers()
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class SlidePlan(Value):
+    """How a hand slides an object along its table: it presses from above, and moves sideways.
+
+    Everything is in the frame of the cloud. f counts fingertips, and h actuated joints.
+
+    Attributes:
+        joints: actuated joints (h,) [rad or m] of the pressing hand; they stay the same.
+        obj_from_hand: pose (4, 4) [m] of the hand's root link where the tips touch the object.
+        presses: mask (f,) of the fingers that press.
+        feet: points (f, 3) [m] where the tips touch; NaN for fingers that do not press.
+        displacement: displacement (3,) [m] of hand and object along the table.
+        force: sum of the normal forces [N] of the pressing fingers.
+        table: the table.
+    """
+
+    joints: Float[Tensor, "h"]
+    obj_from_hand: Pose
+    presses: Bool[Tensor, "f"]
+    feet: Float[Tensor, "f 3"]
+    displacement: Float[Tensor, "3"]
+    force: float
+    table: Plane
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class EdgePlan(Value):
+    """A slide to the table's edge, and the grasps there; `plan_edge_grasps` returns it.
+
+    Attributes:
+        slide: the slide; None if there is none, for which `reason` tells why.
+        grasps: grasps of the object after the slide, or of the object where it stands without one.
+            They are in the frame of the cloud, the best first, as those of `plan_grasps`.
+        reason: why there is no slide: the object hangs over the edge far enough, or no posture of
+            the hand can press on it. Empty if there is a slide.
+    """
+
+    slide: SlidePlan | None
+    grasps: Grasps
+    reason: str = ""
+
+
+@checked
+@single_threaded
+def plan_edge_grasps(
+    cloud: SeenLike,
+    hand: Hand,
+    spec: ContactSpec,
+    starts: Count = 1000,
+    seed: Seed = 0,
+    *,
+    task: GraspTask | None = None,
+    table_friction: Annotated[float, Range(0.0, 10.0)] = 0.3,
+) -> EdgePlan:
+    """Plan a slide of the object to the edge of its table, and grasps there; return both.
+
+    Args:
+        cloud: points that a camera saw [m], as for `plan_grasps`.
+        hand: the hand.
+        spec: constraints. Its `table` must be a plane with an `edge` (`Plane.ending`).
+        starts: number of random initial guesses of the contact planner.
+        seed: random seed.
+        task: what grasps must do; None means `GraspTask()`.
+        table_friction: coefficient of friction between object and table. The pressing force is
+            three times (`SLIDE.reserve`) the least one that moves the object (Coulomb's law).
+
+    Raises:
+        BadArgument: a table without an edge; an object whose centre is beyond the edge; a friction
+            of the fingertips that is not greater than `table_friction`.
+
+    >>> import torch
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.geometry import Plane
+    >>> x = torch.tensor([1.0, 0, 0])
+    >>> spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.2 * x, x))
+    >>> plan = plan_edge_grasps(load_object("cylinder"), load_hand("barrett"), spec, starts=8)
+    """
+    table = spec.plane
+    if table is None or table.edge is None:
+        found = "no table" if table is None else "a table without an edge"
+        raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
+    if not spec.mean_friction > table_friction:
+        found = f"{table_friction:g}, and {spec.mean_friction:g} of the fingertips"
+        raise BadArgument("table_friction", found, "less than the friction of the fingertips")
+    request = Request(
+        as_seen(cloud, "cloud"), hand=hand, spec=spec, seed=seed, starts=starts, task=task
+    )
+    object_ = ShapedObject.of(request)
+    length = _length(object_, table)
+    if length <= SLIDE.shortest:
+        reason = "the object hangs over the edge as far as it can"
+        return EdgePlan(None, plan_shaped(object_, request), reason)
+    mass = Distribution.of(request.grasp_task.mass).most
+    force = _force(mass, spec.mean_friction, table_friction)
+    slide = _find_slide(object_, hand, table, length, force)
+    if slide is None:
+        reason = "no posture of the hand presses on the object from above"
+        return EdgePlan(None, plan_shaped(object_, request), reason)
+    # for the object, the edge comes nearer
+    shift = rigid(torch.eye(3, dtype=torch.float64), slide.displacement)
+    nearer = dataclasses.replace(table, edge=table.edge.moved(inverse(shift)))
+    grasps = plan_shaped(dataclasses.replace(object_, table=nearer), request)
+    grasps = move(grasps, shift)
+    grasps = dataclasses.replace(grasps, meta={**grasps.meta, "table": table.describe()})
+    return EdgePlan(slide, grasps)
+
+
+def _length(object_: ShapedObject, table: Plane) -> float:
+    """Return how far [m] the object must slide, so that its centre of mass is `SLIDE.behind` behind
+    the edge.
+    """
+    assert table.edge is not None
+    centre = apply(object_.obj_from_upright, object_.body.center.cpu().double()[None])[0]
+    return -float(table.edge.height(centre)) - SLIDE.behind
+
+
+def _force(mass: float, friction: float, table_friction: float) -> float:
+    """Return the pressing force [N] that slides an object of a `mass` [kg] (Coulomb's law).
+
+    A force N moves it if the fingers' friction N is at least the table's friction times N plus the
+    weight.
+    """
+    weight = mass * GRAVITY
+    least = table_friction * weight / (friction - table_friction)
+    return min(max(SLIDE.reserve * least, weight), SLIDE.most)
+
+
+def _find_slide(
+    object_: ShapedObject, hand: Hand, table: Plane, length: float, force: float
+) -> SlidePlan | None:
+    """Return the slide of a `length` [m] with the best posture that presses on the object; None if
+    there is none.
+    """
+    assert table.edge is not None
+    hand = hand.to("cpu", torch.float64)
+    frame = object_.obj_from_upright
+    outward = table.edge.normal.double()
+    postures = press_postures(hand)
+    found = _place(object_, hand, postures, inverse(frame)[:3, :3] @ outward, force)
+    if found is None:
+        return None
+    at, upright_from_press = found
+    obj_from_press = frame @ upright_from_press
+    presses = postures.presses[at]
+    feet = apply(obj_from_press, postures.feet[at])
+    return SlidePlan(
+        joints=postures.joints[at],
+        obj_from_hand=obj_from_press @ postures.press_from_hand[at],
+        presses=presses,
+        feet=torch.where(presses[:, None], feet, torch.nan),
+        displacement=length * outward,
+        force=force,
+        table=table,
+    )
+
+
+def _place(
+    object_: ShapedObject,
+    hand: Hand,
+    postures: PressPostures,
+    outward: Float[Tensor, "3"],
+    force: float,
+) -> tuple[int, Float[Tensor, "4 4"]] | None:
+    """Return the index of the best pressing posture, and its pose (4, 4) [m] on the object.
+
+    All is in the upright frame, and `outward` points to the edge. None if no posture fits.
+    """
+    top = _top(object_)
+    centre = object_.body.center.cpu().double()
+    share = postures.presses.sum(1).double()
+    able = flatnonzero(postures.strength >= force / share)
+    angles = torch.arange(SLIDE.turns).double() * (2 * math.pi / SLIDE.turns)
+    turns = _turns(angles)  # (t, 3, 3)
+    for tips in (2, 1):
+        rows = able[postures.presses[able].sum(1) == tips]
+        for back in SLIDE.back:
+            place = centre - back * outward
+            feet = turns @ postures.feet[rows][:, None].mT  # (p, t, 3, f)
+            feet = feet.mT + place  # (p, t, f, 3)
+            presses = postures.presses[rows][:, None].expand(feet.shape[:3])
+            ahead = ((feet - centre) @ outward).where(presses, -math.inf).amax(2)
+            height, flat = top.stand(feet)
+            good = (flat | ~presses).all(2) & (ahead <= SLIDE.behind - SLIDE.supported)
+            high = height.where(presses, -math.inf).amax(2)
+            low = height.where(presses, math.inf).amin(2)
+            good &= high - low <= SLIDE.flat
+            for p, t in torch.nonzero(good).tolist():
+                at = int(rows[p])
+                origin = torch.stack([place[0], place[1], high[p, t]])
+                pose = rigid(turns[t], origin)
+                if _is_clear(object_, hand, postures, at, pose):
+                    return at, pose
+    return None
+
+
+def _turns(angles: Float[Tensor, "t"]) -> Float[Tensor, "t 3 3"]:
+    """Return the rotations about the vertical by `angles` [rad]."""
+    cosine, sine = torch.cos(angles), torch.sin(angles)
+    zero, one = torch.zeros_like(angles), torch.ones_like(angles)
+    rows = [cosine, -sine, zero, sine, cosine, zero, zero, zero, one]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+class _Top:
+    """The top of an object: the vertices [m] of its surface whose normals point up."""
+
+    def __init__(self, vertices: Float[Tensor, "v 3"]) -> None:
+        from scipy.spatial import cKDTree
+
+        self.height = vertices[:, 2]
+        self.tree = cKDTree(vertices[:, :2].numpy())
+        angles = torch.arange(SLIDE.ring).double() * (2 * math.pi / SLIDE.ring)
+        ring = SLIDE.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
+        self.around = torch.cat([ring.new_zeros(1, 2), ring])  # (k, 2)
+
+    def stand(self, feet: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
+        """Return the height [m] of the top below each of `feet` [m], and whether it is flat there,
+        and away from the outline.
+        """
+        places = feet[..., None, :2] + self.around
+        gap, index = self.tree.query(places.reshape(-1, 2).numpy())
+        height = self.height[torch.from_numpy(index)].reshape(places.shape[:-1])
+        near = torch.from_numpy(gap).reshape(places.shape[:-1]) <= SLIDE.near
+        low, high = height.aminmax(dim=-1)
+        return height[..., 0], near.all(-1) & (high - low <= SLIDE.flat)
+
+
+def _top(object_: ShapedObject) -> _Top:
+    """Return the top of an object, in its upright frame."""
+    mesh = object_.surface
+    vertices = mesh.vertices.cpu().double()
+    corners = vertices[mesh.faces.cpu()]  # (f, 3, 3)
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = torch.linalg.vector_norm(normals, dim=-1).clamp_min(torch.finfo(normals.dtype).tiny)
+    upward = normals[:, 2] > SLIDE.upward * size
+    return _Top(corners[upward].mean(1))
+
+
+def _is_clear(
+    object_: ShapedObject,
+    hand: Hand,
+    postures: PressPostures,
+    at: int,
+    pose: Float[Tensor, "4 4"],
+) -> bool:
+    """Return whether a hand in the posture with index `at` at a `pose` [m], and above it, touches
+    the object with its pressing tips alone, and keeps clear of the table.
+    """
+    spheres = hand.collision_spheres
+    pressing = flatnonzero(postures.presses[at])
+    tips = spheres.touching & torch.isin(spheres.finger, pressing)
+    centres = apply(pose, postures.spheres[at])[~tips]
+    radius = spheres.radius.to(centres)[~tips]
+    if float((centres[:, 2] - radius).min()) < SLIDE.clear:
+        return False
+    steps = torch.arange(SLIDE.lowered).double() * (SLIDE.approach / (SLIDE.lowered - 1))
+    path = centres + steps[:, None, None] * torch.eye(3, dtype=torch.float64)[2]
+    field = object_.body.field
+    distance = field.query(path.flatten(0, 1)[None].to(field.nodes))[0][0].cpu().double()
+    return bool((distance - radius.repeat(len(steps)) >= SLIDE.clear).all())
