@@ -500,9 +500,7 @@ class ContactProblem:
         return excess, torch.cat([blocks.flatten(2), by_tension], 2)
 
 
-def _normalised(
-    shape: ShapeLike, plane: Plane | None
-) -> tuple[Float[Tensor, "3"] | None, PerRow]:
+def _normalised(shape: ShapeLike, plane: Plane | None) -> tuple[Float[Tensor, "3"] | None, PerRow]:
     """Return the unit normal of a plane, and its distance (normalised) from the origin; None and 0
     without a plane.
     """
