@@ -281,8 +281,9 @@ class ContactProblem:
     of the shape. `separation` is the least distance of two fingertip centres, `tip_radius` the
     radius of the fingertips, and `ring` the radius within which the surface is flat. The table has
     the unit normal `up` (None without a table) and the distance `floor` from the origin. Its edge
-    has the unit normal `outward` (None without an edge) and the distance `brink`. `beyond` returns the signed distance (q,) of normalised points (q, 3) from the region where contacts may
-    be, negative inside.
+    has the unit normal `outward` (None without an edge) and the distance `brink`. `beyond` returns
+    the signed distance (q,) of normalised points (q, 3) from the region where contacts may be,
+    negative inside.
     """
 
     spec: ContactSpec
@@ -500,9 +501,7 @@ class ContactProblem:
         return excess, torch.cat([blocks.flatten(2), by_tension], 2)
 
 
-def _normalised(
-    shape: ShapeLike, plane: Plane | None
-) -> tuple[Float[Tensor, "3"] | None, PerRow]:
+def _normalised(shape: ShapeLike, plane: Plane | None) -> tuple[Float[Tensor, "3"] | None, PerRow]:
     """Return the unit normal of a plane, and its distance (normalised) from the origin; None and 0
     without a plane.
     """
