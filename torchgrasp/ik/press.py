@@ -15,7 +15,7 @@ from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Seed
 from torchgrasp.geometry.frames import rigid
-from torchgrasp.geometry.linalg import across, fibonacci_sphere
+from torchgrasp.geometry.linalg import across, eye_like, fibonacci_sphere, norm, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.seeds import PostureLibrary
 
@@ -29,7 +29,7 @@ class PressNumbers:
     directions: int = 400
     """Number of directions, over the whole sphere, in which each posture is tried as pressing."""
     level: float = 0.003
-    """Largest difference [m] of the heights of two pressing tips: joints give way by as much."""
+    """Largest difference [m] of the heights of two tips; the hand is then turned to level them."""
     gap: float = 0.006
     """Least distance [m] by which all other links are higher than the pressing tips."""
     cosine: float = 0.5
@@ -40,6 +40,8 @@ class PressNumbers:
     """Least normal force [N] of a pressing finger: a quarter of a kilogram slides with it."""
     strongest: float = 60.0
     """Greatest one: a stretched finger does not give way, and its force is hard to control."""
+    compliance: float = 1e-5
+    """Compliance [m/N] of gears and links, which every fingertip has in all directions."""
     kept: int = 200
     """Number of postures that are kept."""
 
@@ -65,6 +67,8 @@ class PressPostures(Value):
         feet: lowest points (p, f, 3) [m] of the fingertips in the posture's frame.
         strength: greatest normal force (p,) [N] of the weakest pressing finger, by the torques of
             its joints.
+        stiffness: matrix (p, f, 3, 3) [N/m] of each fingertip in the posture's frame: the force
+            with which the drives of the joints resist a displacement of the tip.
         spheres: centres (p, s, 3) [m] of the hand's collision spheres in the posture's frame.
     """
 
@@ -73,6 +77,7 @@ class PressPostures(Value):
     presses: Bool[Tensor, "p f"]
     feet: Float[Tensor, "p f 3"]
     strength: Float[Tensor, "p"]
+    stiffness: Float[Tensor, "p f 3 3"]
     spheres: Float[Tensor, "p s 3"]
 
     def __len__(self) -> int:
@@ -124,7 +129,47 @@ def _search(hand: Hand, seed: int) -> PressPostures:
     row = flatnonzero(best > -math.inf)
     row = row[torch.argsort(best[row], descending=True, stable=True)]
     at = at[row]
-    return _built(hand, joints[row], directions[at], presses[row, at])
+    joints, presses = joints[row], presses[row, at]
+    down = _levelled(centres[row], radius, directions[at], presses)
+    row = flatnonzero(_gap(hand, joints, down, presses) > PRESS.gap)
+    return _built(hand, joints[row], down[row], presses[row])
+
+
+def _levelled(
+    centres: Float[Tensor, "p f 3"],
+    radius: Float[Tensor, "f"],
+    down: Float[Tensor, "p 3"],
+    presses: Bool[Tensor, "p f"],
+) -> Float[Tensor, "p 3"]:
+    """Return the directions of pressing, turned so that two pressing tips touch a plane at once."""
+    two = presses.sum(1) == 2
+    index = presses.to(torch.int64).topk(2, 1).indices  # one tip: any second one, not used
+    first, second = centres.gather(1, index[..., None].expand(-1, -1, 3)).unbind(1)
+    side = first - second
+    length = norm(side, keepdim=True)
+    side = side / length
+    # the component along the side by which the smaller tip reaches as far as the larger one
+    share = (radius[index[:, 1]] - radius[index[:, 0]])[:, None] / length
+    rest = unit(down - (down * side).sum(1, keepdim=True) * side)
+    levelled = share * side + torch.sqrt(1 - share**2) * rest
+    return torch.where(two[:, None], levelled, down)
+
+
+def _gap(
+    hand: Hand,
+    joints: Float[Tensor, "p h"],
+    down: Float[Tensor, "p 3"],
+    presses: Bool[Tensor, "p f"],
+) -> Float[Tensor, "p"]:
+    """Return by how much [m] all other links are higher than the pressing tips."""
+    around = hand.collision_spheres
+    radius = hand.tips.radius.to(down)
+    reach = (hand.tip_centres(joints) @ down[..., None])[..., 0] + radius
+    spheres = hand.sphere_centres(joints)[:, ~around.touching]
+    links = ((spheres @ down[..., None])[..., 0] + around.radius[~around.touching]).amax(1)
+    lowest = torch.where(presses, reach, math.inf).amin(1)
+    others = torch.where(presses, -math.inf, reach).amax(1)
+    return lowest - torch.maximum(links, others)
 
 
 def _apart(
@@ -147,8 +192,7 @@ def _built(
 
     Those that are too weak or too stiff are left out.
     """
-    centres = hand.tip_centres(joints)
-    feet = centres + hand.tips.radius.to(centres)[:, None] * down[:, None]
+    feet = hand.tip_centres(joints) + hand.tips.radius.to(down)[:, None] * down[:, None]
     strength = _strength(hand, joints, feet, down, presses)
     fit = (strength >= PRESS.weakest) & (strength <= PRESS.strongest)
     fit = flatnonzero(fit)[: PRESS.kept]
@@ -168,8 +212,26 @@ def _built(
         presses,
         feet @ turn.mT + shift,
         strength,
+        _stiffness(hand, joints, feet, turn),
         spheres @ turn.mT + shift,
     )
+
+
+def _stiffness(
+    hand: Hand,
+    joints: Float[Tensor, "p h"],
+    feet: Float[Tensor, "p f 3"],
+    turn: Float[Tensor, "p 3 3"],
+) -> Float[Tensor, "p f 3 3"]:
+    """Return the stiffness [N/m] of each fingertip, turned into the posture's frame.
+
+    It is the inverse of the compliance J K^-1 J^T, for the Jacobian J and the joints' stiffness K,
+    plus that of gears and links. `feet` [m] are the tips' lowest points in the hand's frame.
+    """
+    jacobian = turn[:, None] @ hand.jacobian(joints, feet)  # (p, f, 3, h)
+    kp = jacobian.new_tensor([hand.actuators[name].kp for name in hand.joint_names])
+    compliance = (jacobian / kp) @ jacobian.mT
+    return torch.linalg.inv(compliance + PRESS.compliance * eye_like(3, jacobian))
 
 
 def _strength(

@@ -1,8 +1,8 @@
-"""Grasps of a low object at the edge of its table: the hand slides it there, then grasps what hangs
+"""Grasps of a low object at the edge of its table: the hand drags it there, then grasps what hangs
 over.
 
 A fingertip cannot reach below an object that lies flat. So the hand presses on it from above, and
-slides it until a part hangs over the edge, while its centre of mass stays above the table. The
+drags it until a part hangs over the edge, while its centre of mass stays above the table. The
 fingers then pinch this part from above and below.
 """
 
@@ -18,7 +18,7 @@ from torchgrasp.data.accept import SeenLike, as_seen
 from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import Count, Pose, Range, Seed
+from torchgrasp.foundation.rules import ANY, Count, Pose, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse, rigid
 from torchgrasp.geometry.plane import Plane, move
@@ -36,13 +36,13 @@ GRAVITY = 9.81  # acceleration [m/s^2]
 
 
 @dataclasses.dataclass(frozen=True)
-class SlideNumbers:
-    """Parameters of a slide to the edge."""
+class DragNumbers:
+    """Parameters of a drag to the edge."""
 
     behind: float = 0.012
     """Distance [m] behind the edge at which the centre of mass ends: its estimate is 5 mm off."""
     supported: float = 0.004
-    """Least distance [m] behind the edge of each pressing tip at the end of the slide."""
+    """Least distance [m] behind the edge of each pressing tip at the end of the drag."""
     back: tuple[float, ...] = (0.0, 0.01, 0.02)
     """Distances [m] behind the centre of mass at which the tips may press."""
     turns: int = 36
@@ -63,21 +63,25 @@ class SlideNumbers:
     """Number of heights at which the hand is checked on its way down."""
     approach: float = 0.05
     """Height [m] from which the hand comes down."""
+    unloading: float = 0.2
+    """Greatest loss of pressing force for each newton of the drag: then the tips would slip."""
+    digging: float = 0.8
+    """Greatest gain of pressing force for each newton of the drag: then the tips would jam."""
     reserve: float = 3.0
     """Ratio of the pressing force to the least one that moves the object."""
     most: float = 20.0
     """Greatest pressing force [N]: thin things bend, and hands are weak."""
     shortest: float = 0.002
-    """Length [m] of a slide that is not worth while: sensors are off by as much."""
+    """Length [m] of a drag that is not worth while: sensors are off by as much."""
 
 
-SLIDE = SlideNumbers()
+DRAG = DragNumbers()
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
-class SlidePlan(Value):
-    """How a hand slides an object along its table: it presses from above, and moves sideways.
+class DragPlan(Value):
+    """How a hand drags an object along its table: it presses from above, and moves sideways.
 
     Everything is in the frame of the cloud. f counts fingertips, and h actuated joints.
 
@@ -94,7 +98,7 @@ class SlidePlan(Value):
     joints: Float[Tensor, "h"]
     obj_from_hand: Pose
     presses: Bool[Tensor, "f"]
-    feet: Float[Tensor, "f 3"]
+    feet: Annotated[Float[Tensor, "f 3"], ANY]
     displacement: Float[Tensor, "3"]
     force: float
     table: Plane
@@ -103,17 +107,17 @@ class SlidePlan(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class EdgePlan(Value):
-    """A slide to the table's edge, and the grasps there; `plan_edge_grasps` returns it.
+    """A drag to the table's edge, and the grasps there; `plan_edge_grasps` returns it.
 
     Attributes:
-        slide: the slide; None if there is none, for which `reason` tells why.
-        grasps: grasps of the object after the slide, or of the object where it stands without one.
+        drag: the drag; None if there is none, for which `reason` tells why.
+        grasps: grasps of the object after the drag, or of the object where it stands without one.
             They are in the frame of the cloud, the best first, as those of `plan_grasps`.
-        reason: why there is no slide: the object hangs over the edge far enough, or no posture of
-            the hand can press on it. Empty if there is a slide.
+        reason: why there is no drag: the object hangs over the edge far enough, or no posture of
+            the hand can press on it. Empty if there is a drag.
     """
 
-    slide: SlidePlan | None
+    drag: DragPlan | None
     grasps: Grasps
     reason: str = ""
 
@@ -130,7 +134,7 @@ def plan_edge_grasps(
     task: GraspTask | None = None,
     table_friction: Annotated[float, Range(0.0, 10.0)] = 0.3,
 ) -> EdgePlan:
-    """Plan a slide of the object to the edge of its table, and grasps there; return both.
+    """Plan to drag the object to the edge of its table, and grasps there; return both.
 
     Args:
         cloud: points that a camera saw [m], as for `plan_grasps`.
@@ -140,7 +144,7 @@ def plan_edge_grasps(
         seed: random seed.
         task: what grasps must do; None means `GraspTask()`.
         table_friction: coefficient of friction between object and table. The pressing force is
-            three times (`SLIDE.reserve`) the least one that moves the object (Coulomb's law).
+            three times (`DRAG.reserve`) the least one that moves the object (Coulomb's law).
 
     Raises:
         BadArgument: a table without an edge; an object whose centre is beyond the edge; a friction
@@ -165,48 +169,48 @@ def plan_edge_grasps(
     )
     object_ = ShapedObject.of(request)
     length = _length(object_, table)
-    if length <= SLIDE.shortest:
+    if length <= DRAG.shortest:
         reason = "the object hangs over the edge as far as it can"
         return EdgePlan(None, plan_shaped(object_, request), reason)
     mass = Distribution.of(request.grasp_task.mass).most
     force = _force(mass, spec.mean_friction, table_friction)
-    slide = _find_slide(object_, hand, table, length, force)
-    if slide is None:
+    drag = _find_drag(object_, hand, table, length, force)
+    if drag is None:
         reason = "no posture of the hand presses on the object from above"
         return EdgePlan(None, plan_shaped(object_, request), reason)
     # for the object, the edge comes nearer
-    shift = rigid(torch.eye(3, dtype=torch.float64), slide.displacement)
+    shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
     nearer = dataclasses.replace(table, edge=table.edge.moved(inverse(shift)))
     grasps = plan_shaped(dataclasses.replace(object_, table=nearer), request)
     grasps = move(grasps, shift)
     grasps = dataclasses.replace(grasps, meta={**grasps.meta, "table": table.describe()})
-    return EdgePlan(slide, grasps)
+    return EdgePlan(drag, grasps)
 
 
 def _length(object_: ShapedObject, table: Plane) -> float:
-    """Return how far [m] the object must slide, so that its centre of mass is `SLIDE.behind` behind
+    """Return how far [m] the object must be dragged, so that its centre of mass is `DRAG.behind` behind
     the edge.
     """
     assert table.edge is not None
     centre = apply(object_.obj_from_upright, object_.body.center.cpu().double()[None])[0]
-    return -float(table.edge.height(centre)) - SLIDE.behind
+    return -float(table.edge.height(centre)) - DRAG.behind
 
 
 def _force(mass: float, friction: float, table_friction: float) -> float:
-    """Return the pressing force [N] that slides an object of a `mass` [kg] (Coulomb's law).
+    """Return the pressing force [N] that drags an object of a `mass` [kg] (Coulomb's law).
 
     A force N moves it if the fingers' friction N is at least the table's friction times N plus the
     weight.
     """
     weight = mass * GRAVITY
     least = table_friction * weight / (friction - table_friction)
-    return min(max(SLIDE.reserve * least, weight), SLIDE.most)
+    return min(max(DRAG.reserve * least, weight), DRAG.most)
 
 
-def _find_slide(
+def _find_drag(
     object_: ShapedObject, hand: Hand, table: Plane, length: float, force: float
-) -> SlidePlan | None:
-    """Return the slide of a `length` [m] with the best posture that presses on the object; None if
+) -> DragPlan | None:
+    """Return the drag of a `length` [m] with the best posture that presses on the object; None if
     there is none.
     """
     assert table.edge is not None
@@ -221,7 +225,7 @@ def _find_slide(
     obj_from_press = frame @ upright_from_press
     presses = postures.presses[at]
     feet = apply(obj_from_press, postures.feet[at])
-    return SlidePlan(
+    return DragPlan(
         joints=postures.joints[at],
         obj_from_hand=obj_from_press @ postures.press_from_hand[at],
         presses=presses,
@@ -247,21 +251,22 @@ def _place(
     centre = object_.body.center.cpu().double()
     share = postures.presses.sum(1).double()
     able = flatnonzero(postures.strength >= force / share)
-    angles = torch.arange(SLIDE.turns).double() * (2 * math.pi / SLIDE.turns)
+    angles = torch.arange(DRAG.turns).double() * (2 * math.pi / DRAG.turns)
     turns = _turns(angles)  # (t, 3, 3)
+    steady = _is_steady(postures, turns.mT @ outward)  # (p, t)
     for tips in (2, 1):
         rows = able[postures.presses[able].sum(1) == tips]
-        for back in SLIDE.back:
+        for back in DRAG.back:
             place = centre - back * outward
             feet = turns @ postures.feet[rows][:, None].mT  # (p, t, 3, f)
             feet = feet.mT + place  # (p, t, f, 3)
             presses = postures.presses[rows][:, None].expand(feet.shape[:3])
             ahead = ((feet - centre) @ outward).where(presses, -math.inf).amax(2)
             height, flat = top.stand(feet)
-            good = (flat | ~presses).all(2) & (ahead <= SLIDE.behind - SLIDE.supported)
+            good = steady[rows] & (flat | ~presses).all(2) & (ahead <= DRAG.behind - DRAG.supported)
             high = height.where(presses, -math.inf).amax(2)
             low = height.where(presses, math.inf).amin(2)
-            good &= high - low <= SLIDE.flat
+            good &= high - low <= DRAG.flat
             for p, t in torch.nonzero(good).tolist():
                 at = int(rows[p])
                 origin = torch.stack([place[0], place[1], high[p, t]])
@@ -269,6 +274,20 @@ def _place(
                 if _is_clear(object_, hand, postures, at, pose):
                     return at, pose
     return None
+
+
+def _is_steady(postures: PressPostures, ways: Float[Tensor, "t 3"]) -> Bool[Tensor, "p t"]:
+    """Return whether each posture presses on steadily while it drags along each of `ways`.
+
+    Where a tip sticks, a motion of the palm along the unit vector w changes the tip's force by K w,
+    for its stiffness K. So each newton of the drag, w . K w, changes the pressing force by
+    -z . K w.
+    """
+    force = torch.einsum("pfij,tj->ptfi", postures.stiffness, ways)
+    along = (force * ways[:, None]).sum(-1)
+    change = -force[..., 2] / along
+    steady = (change >= -DRAG.unloading) & (change <= DRAG.digging)
+    return (steady | ~postures.presses[:, None]).all(2)
 
 
 def _turns(angles: Float[Tensor, "t"]) -> Float[Tensor, "t 3 3"]:
@@ -287,8 +306,8 @@ class _Top:
 
         self.height = vertices[:, 2]
         self.tree = cKDTree(vertices[:, :2].numpy())
-        angles = torch.arange(SLIDE.ring).double() * (2 * math.pi / SLIDE.ring)
-        ring = SLIDE.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
+        angles = torch.arange(DRAG.ring).double() * (2 * math.pi / DRAG.ring)
+        ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
         self.around = torch.cat([ring.new_zeros(1, 2), ring])  # (k, 2)
 
     def stand(self, feet: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
@@ -298,9 +317,9 @@ class _Top:
         places = feet[..., None, :2] + self.around
         gap, index = self.tree.query(places.reshape(-1, 2).numpy())
         height = self.height[torch.from_numpy(index)].reshape(places.shape[:-1])
-        near = torch.from_numpy(gap).reshape(places.shape[:-1]) <= SLIDE.near
+        near = torch.from_numpy(gap).reshape(places.shape[:-1]) <= DRAG.near
         low, high = height.aminmax(dim=-1)
-        return height[..., 0], near.all(-1) & (high - low <= SLIDE.flat)
+        return height[..., 0], near.all(-1) & (high - low <= DRAG.flat)
 
 
 def _top(object_: ShapedObject) -> _Top:
@@ -310,7 +329,7 @@ def _top(object_: ShapedObject) -> _Top:
     corners = vertices[mesh.faces.cpu()]  # (f, 3, 3)
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = torch.linalg.vector_norm(normals, dim=-1).clamp_min(torch.finfo(normals.dtype).tiny)
-    upward = normals[:, 2] > SLIDE.upward * size
+    upward = normals[:, 2] > DRAG.upward * size
     return _Top(corners[upward].mean(1))
 
 
@@ -329,10 +348,10 @@ def _is_clear(
     tips = spheres.touching & torch.isin(spheres.finger, pressing)
     centres = apply(pose, postures.spheres[at])[~tips]
     radius = spheres.radius.to(centres)[~tips]
-    if float((centres[:, 2] - radius).min()) < SLIDE.clear:
+    if float((centres[:, 2] - radius).min()) < DRAG.clear:
         return False
-    steps = torch.arange(SLIDE.lowered).double() * (SLIDE.approach / (SLIDE.lowered - 1))
+    steps = torch.arange(DRAG.lowered).double() * (DRAG.approach / (DRAG.lowered - 1))
     path = centres + steps[:, None, None] * torch.eye(3, dtype=torch.float64)[2]
     field = object_.body.field
     distance = field.query(path.flatten(0, 1)[None].to(field.nodes))[0][0].cpu().double()
-    return bool((distance - radius.repeat(len(steps)) >= SLIDE.clear).all())
+    return bool((distance - radius.repeat(len(steps)) >= DRAG.clear).all())

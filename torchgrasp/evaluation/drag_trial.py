@@ -1,0 +1,280 @@
+"""Simulated drags: a hand drags the true object to the edge of its table, then lifts it there."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.cloud.agreement import check_stand
+from torchgrasp.control.drag import DRAGGING, DragController
+from torchgrasp.control.finger_forces import drive_stiffness, stiff_drives
+from torchgrasp.control.reference import ClosingReference
+from torchgrasp.data.shipped import GraspObject
+from torchgrasp.evaluation.frame import moved_mesh, world_frame
+from torchgrasp.evaluation.lift import close_hand
+from torchgrasp.evaluation.protocols import draw_trial
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import Pose, Seed
+from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.hand.hand import Hand
+from torchgrasp.planner.edge import DragPlan, EdgePlan
+from torchgrasp.sim.convex_parts import read_solid
+from torchgrasp.sim.scene_spec import SceneSpec
+from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
+from torchgrasp.values.closing import ClosingGains, ClosureResult, SensorModel
+from torchgrasp.values.distribution import Distribution
+from torchgrasp.values.specs import TrialSpec
+
+
+@dataclasses.dataclass(frozen=True)
+class DragTrialNumbers:
+    """Parameters of a simulated drag and of its verdict."""
+
+    rest: float = 0.5
+    """Time [s] after the drag in which the object comes to rest."""
+    longest: float = 30.0
+    """Time [s] after which a drag is ended."""
+    fallen: float = 0.01
+    """Fall [m] of the object's centre of mass, or"""
+    tipped: float = math.radians(10)
+    """turn [rad] of its vertical, from which it has fallen off the table."""
+    decimals: int = 9
+    """Decimals to which the table's edge [m] is rounded."""
+
+
+TRIAL = DragTrialNumbers()
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class DragResult(Value):
+    """The record of a simulated drag.
+
+    Attributes:
+        status: `OK`; `NO_CONTACT` if the hand could not press; `DROPPED` if the object fell off the
+            table; `START_OVERLAP` or `UNSTABLE` as in `close_hand`.
+        motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform.
+        missed: distance [m] of the object's centre from where the plan wanted it.
+        forces: sum (t,) [N] of the true normal forces of the fingertips at each control tick.
+    """
+
+    status: Status
+    motion: Pose
+    missed: float
+    forces: Float[Tensor, "t"]
+
+
+@checked
+@single_threaded
+def drag_object(
+    plan: DragPlan,
+    hand: Hand,
+    mesh: "trimesh.Trimesh | Path | str | GraspObject",
+    spec: TrialSpec | None = None,
+    seed: Seed = 0,
+    *,
+    parts: "Sequence[trimesh.Trimesh] | None" = None,
+    table: Plane | None = None,
+) -> DragResult:
+    """Drag the true object as planned, in simulation; return where it came to rest.
+
+    Args:
+        plan: the drag, from `plan_edge_grasps`.
+        hand: the hand of the plan.
+        mesh: the true object [m], closed, in the frame of the plan: a trimesh, a file, or a
+            `GraspObject`.
+        spec: parameters of the trial; None means `TrialSpec()`. Its closing is not used.
+        seed: seed of the sensors' noise, and of friction and mass if the `spec` has distributions
+            of them.
+        parts: convex parts [m] of the mesh. None means those of a `GraspObject`, or those that
+            `convex_parts` computes.
+        table: the true table, with its edge. None means that of the plan.
+
+    Raises:
+        BadArgument: a plan of another hand, or a mesh that does not stand on the table.
+        MeshError: the mesh is missing, open or without volume.
+        MissingExtra: the simulator is not installed.
+    """
+    if isinstance(mesh, GraspObject):
+        parts = mesh.parts if parts is None else parts
+        mesh = mesh.mesh
+    mesh = read_mesh(mesh)
+    table = plan.table if table is None else table
+    check_stand(mesh, table)
+    spec = draw_trial(TrialSpec() if spec is None else spec, seed)
+    return _Drag(plan, hand.to("cpu", torch.float64), mesh, parts, table, spec, seed).complete()
+
+
+@checked
+@single_threaded
+def lift_from_edge(
+    plan: EdgePlan,
+    hand: Hand,
+    mesh: "trimesh.Trimesh | Path | str | GraspObject",
+    spec: TrialSpec | None = None,
+    seed: Seed = 0,
+    *,
+    parts: "Sequence[trimesh.Trimesh] | None" = None,
+    table: Plane | None = None,
+) -> ClosureResult | DragResult:
+    """Drag the true object to the edge, close the hand with the plan's first grasp, and lift.
+
+    The hand is closed where the plan expects the object, on the object where the drag left it.
+
+    Args:
+        plan: drag and grasps, from `plan_edge_grasps`, with at least one grasp.
+        hand: the hand of the plan.
+        mesh: the true object [m], as for `drag_object`.
+        spec: parameters of both trials; None means `TrialSpec()`.
+        seed: seed of both trials.
+        parts: convex parts [m] of the mesh, as for `drag_object`.
+        table: the true table, with its edge. None means that of the plan.
+
+    Returns:
+        The record of the lift, or of the drag if that failed.
+
+    Raises the errors of `drag_object` and `close_hand`.
+    """
+    if isinstance(mesh, GraspObject):
+        parts = mesh.parts if parts is None else parts
+        mesh = mesh.mesh
+    mesh, parts = read_solid(read_mesh(mesh), parts)
+    grasp = plan.grasps[:1]
+    table = grasp.table if table is None else table
+    if plan.drag is not None:
+        dragged = drag_object(plan.drag, hand, mesh, spec, seed, parts=parts, table=table)
+        if dragged.status is not Status.OK:
+            return dragged
+        motion = dragged.motion.numpy()
+        mesh, *parts = (x.copy().apply_transform(motion) for x in (mesh, *parts))
+    return close_hand(grasp, hand, mesh, spec, seed, parts=parts, table=table)
+
+
+class _Drag:
+    """One simulated drag."""
+
+    def __init__(
+        self,
+        plan: DragPlan,
+        hand: Hand,
+        mesh: "trimesh.Trimesh",
+        parts: "Sequence[trimesh.Trimesh] | None",
+        table: Plane,
+        spec: TrialSpec,
+        seed: int,
+    ) -> None:
+        pose = plan.obj_from_hand.double()
+        self.plan = plan
+        self.spec = spec
+        self.obj_from_world = world_frame(table, pose)
+        mesh, parts = read_solid(mesh, parts)
+        solid, *pieces = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
+        self.controller = DragController(plan, hand)
+        world_from_hand = inverse(self.obj_from_world) @ pose
+        start = world_from_hand[:3, :3] @ self.controller.targets.palm
+        joints = {name: float(q) for name, q in hand.expand(plan.joints.double()).items()}
+        scene_spec = SceneSpec(
+            urdf_path=hand.urdf_path,
+            world_from_hand=world_from_hand.numpy(),
+            joints=joints,
+            drives=stiff_drives(hand, spec.kp),
+            tip_links=tuple(hand.tips.links),
+            mesh=solid,
+            parts=pieces,
+            mass=Distribution.of(spec.mass).mean,
+            friction=Distribution.of(spec.friction).mean,
+            table_friction=spec.table_friction,
+            gravity=spec.gravity,
+            timestep=spec.timestep,
+            patch=spec.patch,
+            height=0.0,
+            edge=self._edge(table),
+            self_pairs=hand.self_pairs if spec.self_collision else (),
+            yields=float(norm(plan.displacement)) + float(norm(start)) + DRAGGING.lag + DRAGGING.deepest,
+            start=tuple(start.tolist()),
+        )
+        self.scene = open_scene(scene_spec, spec.simulator)
+        generator = torch.Generator().manual_seed(seed) if spec.noise else None
+        self.robot = SimulatedHand(
+            self.scene, _reference(hand, plan, spec), spec.control_rate, generator
+        )
+        self.overlap = self.scene.penetration()
+
+    def _edge(self, table: Plane) -> tuple[float, float, float] | None:
+        """Return the table's edge in the simulator's frame."""
+        edge = table.moved(inverse(self.obj_from_world)).edge
+        if edge is None:
+            return None
+        x, y, _ = edge.normal.tolist()
+        length = math.hypot(x, y)
+        return x / length, y / length, round(edge.offset, TRIAL.decimals)
+
+    def complete(self) -> DragResult:
+        """Run the drag; return its record."""
+        forces = list[float]()
+        start = self.scene.object_pose()
+        if self.overlap > self.spec.overlap:
+            return self._result(Status.START_OVERLAP, start, forces)
+        observation = self.robot.tick(self.controller.targets)
+        for _ in range(self.robot.ticks(TRIAL.longest)):
+            if self.controller.phase == "done":
+                break
+            targets = self.controller.step(observation, self.robot.period)
+            observation = self.robot.tick(targets)
+            forces.append(float(self.robot.force.sum()))
+        self.robot.rest(self.robot.ticks(TRIAL.rest))
+        return self._result(self.controller.status, start, forces)
+
+    def _result(self, status: Status, start: np.ndarray, forces: list[float]) -> DragResult:
+        """Return the record of a drag; its status tells whether the object fell."""
+        pose = self.scene.object_pose()
+        moved = torch.from_numpy(pose @ np.linalg.inv(start))
+        centre = torch.from_numpy(self.scene.centre)
+        before = apply(torch.from_numpy(start), centre[None])[0]
+        after = apply(torch.from_numpy(pose), centre[None])[0]
+        world_from_obj = inverse(self.obj_from_world)
+        wanted = world_from_obj[:3, :3] @ self.plan.displacement.double()
+        if status is Status.OK:
+            if not bool(torch.isfinite(moved).all()):
+                status = Status.UNSTABLE
+            elif after[2] < before[2] - TRIAL.fallen or moved[2, 2] < math.cos(TRIAL.tipped):
+                status = Status.DROPPED
+        motion = self.obj_from_world @ moved @ world_from_obj
+        return DragResult(
+            status,
+            motion,
+            float(norm(after - before - wanted)),
+            torch.tensor(forces, dtype=torch.float64),
+        )
+
+
+def _reference(hand: Hand, plan: DragPlan, spec: TrialSpec) -> ClosingReference:
+    """Return what the fingertips' sensors need to know: the fingers touch from above."""
+    f = len(hand.tips)
+    joints = plan.joints.double()
+    normals = (plan.table.normal.double() @ plan.obj_from_hand[:3, :3].double()).expand(f, 3)
+    still = torch.zeros(f, 3, dtype=torch.float64)
+    gains = ClosingGains(still, torch.zeros(f, 3, 3, dtype=torch.float64), still, still, still)
+    return ClosingReference(
+        hand,
+        drive_stiffness(hand, spec.kp),
+        obj_from_hand=plan.obj_from_hand.double(),
+        pregrasp=joints,
+        joints=joints,
+        squeeze=joints,
+        normals=normals.clone(),
+        gains=gains,
+        sensor=spec.sensor or SensorModel(),
+    )
