@@ -82,7 +82,7 @@ class DragController:
         self.plan = plan
         self.up = plan.table.normal.double() @ turn
         self.way = plan.displacement.double() @ turn
-        self.presses: Bool[Tensor, "f"] = plan.presses
+        self.presses: Bool[Tensor, f] = plan.presses
         self.joints = hand.to("cpu", torch.float64).expand_joints(plan.joints.double())
         self.phase: Phase = "down"
         self.status = Status.OK
@@ -94,9 +94,7 @@ class DragController:
         self.targets = self._targets()
 
     @checked
-    def step(
-        self, observation: Observation, period: Annotated[float, Range(1e-5, 1.0)]
-    ) -> Targets:
+    def step(self, observation: Observation, period: Annotated[float, Range(1e-5, 1.0)]) -> Targets:
         """Return the targets of joints and palm for the next tick.
 
         Args:

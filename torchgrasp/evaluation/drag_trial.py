@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,13 +17,14 @@ from torchgrasp.control.finger_forces import drive_stiffness, stiff_drives
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.data.shipped import GraspObject
 from torchgrasp.evaluation.frame import moved_mesh, world_frame
-from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.evaluation.protocols import draw_trial
+from torchgrasp.evaluation.several_tries import LiftTry, lift_grasps
+from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.foundation.rules import Pose, Seed
+from torchgrasp.foundation.rules import Count, Pose, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import norm
@@ -30,10 +32,11 @@ from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.edge import DragPlan, EdgePlan
+from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene_spec import SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
-from torchgrasp.values.closing import ClosingGains, ClosureResult, SensorModel
+from torchgrasp.values.closing import ClosingGains, SensorModel
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.specs import TrialSpec
 
@@ -110,11 +113,28 @@ def drag_object(
     if isinstance(mesh, GraspObject):
         parts = mesh.parts if parts is None else parts
         mesh = mesh.mesh
-    mesh = read_mesh(mesh)
+    solid = read_mesh(mesh)
     table = plan.table if table is None else table
-    check_stand(mesh, table)
+    check_stand(solid, table)
     spec = draw_trial(TrialSpec() if spec is None else spec, seed)
-    return _Drag(plan, hand.to("cpu", torch.float64), mesh, parts, table, spec, seed).complete()
+    return _Drag(plan, hand.to("cpu", torch.float64), solid, parts, table, spec, seed).complete()
+
+
+class EdgeLift(NamedTuple):
+    """The record of a drag and of the lift after it; `lift_from_edge` returns it.
+
+    Attributes:
+        drag: record of the drag; None if the plan has none.
+        tries: the tries of the lift (`lift_grasps`); empty if the drag failed.
+    """
+
+    drag: DragResult | None
+    tries: tuple[LiftTry, ...]
+
+    @property
+    def held(self) -> bool:
+        """Whether the last try held the object."""
+        return bool(self.tries) and self.tries[-1].result.held
 
 
 @checked
@@ -126,40 +146,45 @@ def lift_from_edge(
     spec: TrialSpec | None = None,
     seed: Seed = 0,
     *,
+    tries: Count = 1,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
     table: Plane | None = None,
-) -> ClosureResult | DragResult:
-    """Drag the true object to the edge, close the hand with the plan's first grasp, and lift.
+) -> EdgeLift:
+    """Drag the true object to the edge, then lift it with the plan's grasps, the first one first.
 
-    The hand is closed where the plan expects the object, on the object where the drag left it.
+    The grasps are where the plan expects the object, and the object is where the drag left it.
 
     Args:
-        plan: drag and grasps, from `plan_edge_grasps`, with at least one grasp.
+        plan: drag and grasps, from `plan_edge_grasps`, with at least one executable grasp.
         hand: the hand of the plan.
         mesh: the true object [m], as for `drag_object`.
         spec: parameters of both trials; None means `TrialSpec()`.
         seed: seed of both trials.
+        tries: largest number of grasps that are tried (`lift_grasps`).
         parts: convex parts [m] of the mesh, as for `drag_object`.
         table: the true table, with its edge. None means that of the plan.
 
-    Returns:
-        The record of the lift, or of the drag if that failed.
-
-    Raises the errors of `drag_object` and `close_hand`.
+    Raises the errors of `drag_object` and `lift_grasps`, and `BadArgument` for a plan without an
+    executable grasp.
     """
+    good = plan.grasps[plan.grasps.status == Status.OK]
+    if not len(good):
+        raise BadArgument("plan", "no executable grasp", "at least one")
     if isinstance(mesh, GraspObject):
         parts = mesh.parts if parts is None else parts
         mesh = mesh.mesh
     mesh, parts = read_solid(read_mesh(mesh), parts)
-    grasp = plan.grasps[:1]
-    table = grasp.table if table is None else table
+    table = good.table if table is None else table
+    drag = None
     if plan.drag is not None:
-        dragged = drag_object(plan.drag, hand, mesh, spec, seed, parts=parts, table=table)
-        if dragged.status is not Status.OK:
-            return dragged
-        motion = dragged.motion.numpy()
+        drag = drag_object(plan.drag, hand, mesh, spec, seed, parts=parts, table=table)
+        if drag.status is not Status.OK:
+            return EdgeLift(drag, ())
+        motion = drag.motion.numpy()
         mesh, *parts = (x.copy().apply_transform(motion) for x in (mesh, *parts))
-    return close_hand(grasp, hand, mesh, spec, seed, parts=parts, table=table)
+    truth = Truth(mesh, parts, table=table)
+    trial = GraspTrial(hand, good, truth, seed, surface=surface_field(plan.shape))
+    return EdgeLift(drag, lift_grasps(trial, spec, tries))
 
 
 class _Drag:
@@ -202,7 +227,10 @@ class _Drag:
             height=0.0,
             edge=self._edge(table),
             self_pairs=hand.self_pairs if spec.self_collision else (),
-            yields=float(norm(plan.displacement)) + float(norm(start)) + DRAGGING.lag + DRAGGING.deepest,
+            yields=float(norm(plan.displacement))
+            + float(norm(start))
+            + DRAGGING.lag
+            + DRAGGING.deepest,
             start=tuple(start.tolist()),
         )
         self.scene = open_scene(scene_spec, spec.simulator)

@@ -172,9 +172,7 @@ def _gap(
     return lowest - torch.maximum(links, others)
 
 
-def _apart(
-    centres: Float[Tensor, "s f 3"], presses: Bool[Tensor, "s d f"]
-) -> Float[Tensor, "s d"]:
+def _apart(centres: Float[Tensor, "s f 3"], presses: Bool[Tensor, "s d f"]) -> Float[Tensor, "s d"]:
     """Return the least distance [m] of two pressing tips; infinite for one tip."""
     gaps = torch.cdist(centres, centres)  # (s, f, f)
     both = presses[..., :, None] & presses[..., None, :]

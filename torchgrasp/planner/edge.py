@@ -14,19 +14,22 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.data.accept import SeenLike, as_seen
+from torchgrasp.data.accept import HandLike, SeenLike, as_hand, as_seen
 from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, Count, Pose, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse, rigid
+from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.geometry.plane import Plane, move
+from torchgrasp.geometry.signed_distance import DistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.press import PressPostures, press_postures
 from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.run import plan_shaped
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
@@ -43,9 +46,13 @@ class DragNumbers:
     """Distance [m] behind the edge at which the centre of mass ends: its estimate is 5 mm off."""
     supported: float = 0.004
     """Least distance [m] behind the edge of each pressing tip at the end of the drag."""
-    back: tuple[float, ...] = (0.0, 0.01, 0.02)
-    """Distances [m] behind the centre of mass at which the tips may press."""
-    turns: int = 36
+    spacing: float = 0.008
+    """Distance [m] of the places on the object's top where the hand may press."""
+    places: int = 60
+    """Number of these places that are tried, those nearest to the centre of mass."""
+    postures: int = 40
+    """Number of postures of two tips, and of one, that are tried at each place."""
+    turns: int = 24
     """Number of directions about the vertical in which each posture is tried."""
     upward: float = 0.9
     """Least upward part of the unit normal where a tip presses: 25 degrees."""
@@ -63,6 +70,8 @@ class DragNumbers:
     """Number of heights at which the hand is checked on its way down."""
     approach: float = 0.05
     """Height [m] from which the hand comes down."""
+    steps: int = 8
+    """Number of places on the way along the table at which hand and object are checked."""
     unloading: float = 0.2
     """Greatest loss of pressing force for each newton of the drag: then the tips would slip."""
     digging: float = 0.8
@@ -113,12 +122,14 @@ class EdgePlan(Value):
         drag: the drag; None if there is none, for which `reason` tells why.
         grasps: grasps of the object after the drag, or of the object where it stands without one.
             They are in the frame of the cloud, the best first, as those of `plan_grasps`.
+        shape: the estimated shape after the drag, in the same frame.
         reason: why there is no drag: the object hangs over the edge far enough, or no posture of
-            the hand can press on it. Empty if there is a drag.
+            the hand can press on it, or a neighbour is in its way. Empty if there is a drag.
     """
 
     drag: DragPlan | None
     grasps: Grasps
+    shape: ShapeGP
     reason: str = ""
 
 
@@ -126,7 +137,7 @@ class EdgePlan(Value):
 @single_threaded
 def plan_edge_grasps(
     cloud: SeenLike,
-    hand: Hand,
+    hand: HandLike,
     spec: ContactSpec,
     starts: Count = 1000,
     seed: Seed = 0,
@@ -138,7 +149,7 @@ def plan_edge_grasps(
 
     Args:
         cloud: points that a camera saw [m], as for `plan_grasps`.
-        hand: the hand.
+        hand: the hand, or its name or folder.
         spec: constraints. Its `table` must be a plane with an `edge` (`Plane.ending`).
         starts: number of random initial guesses of the contact planner.
         seed: random seed.
@@ -164,27 +175,27 @@ def plan_edge_grasps(
     if not spec.mean_friction > table_friction:
         found = f"{table_friction:g}, and {spec.mean_friction:g} of the fingertips"
         raise BadArgument("table_friction", found, "less than the friction of the fingertips")
-    request = Request(
-        as_seen(cloud, "cloud"), hand=hand, spec=spec, seed=seed, starts=starts, task=task
-    )
+    hand = as_hand(hand, "hand")
+    request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
     object_ = ShapedObject.of(request)
+    shape = object_.shape.moved(object_.obj_from_upright)
     length = _length(object_, table)
     if length <= DRAG.shortest:
         reason = "the object hangs over the edge as far as it can"
-        return EdgePlan(None, plan_shaped(object_, request), reason)
+        return EdgePlan(None, plan_shaped(object_, request), shape, reason)
     mass = Distribution.of(request.grasp_task.mass).most
     force = _force(mass, spec.mean_friction, table_friction)
     drag = _find_drag(object_, hand, table, length, force)
     if drag is None:
-        reason = "no posture of the hand presses on the object from above"
-        return EdgePlan(None, plan_shaped(object_, request), reason)
+        reason = "no posture presses on the object from above, or a neighbour is in its way"
+        return EdgePlan(None, plan_shaped(object_, request), shape, reason)
     # for the object, the edge comes nearer
     shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
     nearer = dataclasses.replace(table, edge=table.edge.moved(inverse(shift)))
     grasps = plan_shaped(dataclasses.replace(object_, table=nearer), request)
     grasps = move(grasps, shift)
     grasps = dataclasses.replace(grasps, meta={**grasps.meta, "table": table.describe()})
-    return EdgePlan(drag, grasps)
+    return EdgePlan(drag, grasps, shape.moved(shift))
 
 
 def _length(object_: ShapedObject, table: Plane) -> float:
@@ -218,7 +229,10 @@ def _find_drag(
     frame = object_.obj_from_upright
     outward = table.edge.normal.double()
     postures = press_postures(hand)
-    found = _place(object_, hand, postures, inverse(frame)[:3, :3] @ outward, force)
+    way = length * (inverse(frame)[:3, :3] @ outward)
+    if not _is_free(object_, way):
+        return None
+    found = _place(object_, hand, postures, way, force)
     if found is None:
         return None
     at, upright_from_press = found
@@ -240,38 +254,38 @@ def _place(
     object_: ShapedObject,
     hand: Hand,
     postures: PressPostures,
-    outward: Float[Tensor, "3"],
+    way: Float[Tensor, "3"],
     force: float,
 ) -> tuple[int, Float[Tensor, "4 4"]] | None:
     """Return the index of the best pressing posture, and its pose (4, 4) [m] on the object.
 
-    All is in the upright frame, and `outward` points to the edge. None if no posture fits.
+    All is in the upright frame, and `way` [m] leads to the edge. None if no posture fits.
     """
+    outward = unit(way)
     top = _top(object_)
     centre = object_.body.center.cpu().double()
+    places = top.places(centre, outward)
     share = postures.presses.sum(1).double()
     able = flatnonzero(postures.strength >= force / share)
-    angles = torch.arange(DRAG.turns).double() * (2 * math.pi / DRAG.turns)
+    angles = torch.arange(DRAG.turns, device="cpu").double() * (2 * math.pi / DRAG.turns)
     turns = _turns(angles)  # (t, 3, 3)
     steady = _is_steady(postures, turns.mT @ outward)  # (p, t)
     for tips in (2, 1):
-        rows = able[postures.presses[able].sum(1) == tips]
-        for back in DRAG.back:
-            place = centre - back * outward
-            feet = turns @ postures.feet[rows][:, None].mT  # (p, t, 3, f)
-            feet = feet.mT + place  # (p, t, f, 3)
-            presses = postures.presses[rows][:, None].expand(feet.shape[:3])
+        rows = able[postures.presses[able].sum(1) == tips][: DRAG.postures]
+        presses = postures.presses[rows][:, None]
+        turned = (turns @ postures.feet[rows][:, None].mT).mT  # (p, t, f, 3)
+        for place in places:
+            feet = turned + place
             ahead = ((feet - centre) @ outward).where(presses, -math.inf).amax(2)
             height, flat = top.stand(feet)
-            good = steady[rows] & (flat | ~presses).all(2) & (ahead <= DRAG.behind - DRAG.supported)
-            high = height.where(presses, -math.inf).amax(2)
             low = height.where(presses, math.inf).amin(2)
-            good &= high - low <= DRAG.flat
+            high = height.where(presses, -math.inf).amax(2)
+            good = steady[rows] & (flat | ~presses).all(2) & (high - low <= DRAG.flat)
+            good &= ahead <= DRAG.behind - DRAG.supported
             for p, t in torch.nonzero(good).tolist():
                 at = int(rows[p])
-                origin = torch.stack([place[0], place[1], high[p, t]])
-                pose = rigid(turns[t], origin)
-                if _is_clear(object_, hand, postures, at, pose):
+                pose = rigid(turns[t], torch.stack([place[0], place[1], high[p, t]]))
+                if _is_clear(object_, hand, postures, at, pose, way):
                     return at, pose
     return None
 
@@ -302,13 +316,28 @@ class _Top:
     """The top of an object: the vertices [m] of its surface whose normals point up."""
 
     def __init__(self, vertices: Float[Tensor, "v 3"]) -> None:
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
+        self.points = vertices
         self.height = vertices[:, 2]
-        self.tree = cKDTree(vertices[:, :2].numpy())
-        angles = torch.arange(DRAG.ring).double() * (2 * math.pi / DRAG.ring)
+        self.tree = KDTree(vertices[:, :2].numpy())
+        angles = torch.arange(DRAG.ring, device="cpu").double() * (2 * math.pi / DRAG.ring)
         ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
         self.around = torch.cat([ring.new_zeros(1, 2), ring])  # (k, 2)
+
+    def places(
+        self, centre: Float[Tensor, "3"], outward: Float[Tensor, "3"]
+    ) -> Float[Tensor, "k 3"]:
+        """Return places [m] on the top, far enough from the edge, those nearest to the `centre`
+        first.
+        """
+        cells = torch.round((self.points - centre)[:, :2] / DRAG.spacing)
+        cells = torch.unique(cells, dim=0)
+        places = torch.cat([centre[:2] + DRAG.spacing * cells, torch.zeros_like(cells[:, :1])], 1)
+        offset = places - centre
+        places = places[offset @ outward <= DRAG.behind - DRAG.supported]
+        distance = norm((places - centre)[:, :2])
+        return places[torch.argsort(distance, stable=True)][: DRAG.places]
 
     def stand(self, feet: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
         """Return the height [m] of the top below each of `feet` [m], and whether it is flat there,
@@ -333,15 +362,36 @@ def _top(object_: ShapedObject) -> _Top:
     return _Top(corners[upward].mean(1))
 
 
+def _is_free(object_: ShapedObject, way: Float[Tensor, "3"]) -> bool:
+    """Return whether no neighbour is in the object's way along the table."""
+    if object_.obstacles is None:
+        return True
+    vertices = object_.surface.vertices.cpu().double()
+    path = vertices + _shares()[:, None, None] * way
+    field = object_.obstacles.field
+    before = field.query(vertices.to(field.nodes))[0].min()
+    nearest = field.query(path.flatten(0, 1).to(field.nodes))[0].min()
+    # noise of the grid may let the object touch an obstacle where it stands
+    return bool(nearest >= torch.clamp(before, max=0.0))
+
+
+def _shares() -> Float[Tensor, "k"]:
+    """Return the shares of the way at which collisions are checked."""
+    return torch.linspace(0, 1, DRAG.steps, dtype=torch.float64, device="cpu")
+
+
 def _is_clear(
     object_: ShapedObject,
     hand: Hand,
     postures: PressPostures,
     at: int,
     pose: Float[Tensor, "4 4"],
+    way: Float[Tensor, "3"],
 ) -> bool:
-    """Return whether a hand in the posture with index `at` at a `pose` [m], and above it, touches
-    the object with its pressing tips alone, and keeps clear of the table.
+    """Return whether a hand presses with its pressing tips alone, and keeps clear of all else.
+
+    The hand is in the posture with index `at` at a `pose` [m]. It comes down from above, and moves
+    with the object along the `way` [m], clear of the table and of the object's neighbours.
     """
     spheres = hand.collision_spheres
     pressing = flatnonzero(postures.presses[at])
@@ -350,8 +400,18 @@ def _is_clear(
     radius = spheres.radius.to(centres)[~tips]
     if float((centres[:, 2] - radius).min()) < DRAG.clear:
         return False
-    steps = torch.arange(DRAG.lowered).double() * (DRAG.approach / (DRAG.lowered - 1))
-    path = centres + steps[:, None, None] * torch.eye(3, dtype=torch.float64)[2]
-    field = object_.body.field
-    distance = field.query(path.flatten(0, 1)[None].to(field.nodes))[0][0].cpu().double()
-    return bool((distance - radius.repeat(len(steps)) >= DRAG.clear).all())
+    heights = torch.linspace(0, DRAG.approach, DRAG.lowered, dtype=torch.float64, device="cpu")
+    up = torch.eye(3, dtype=torch.float64, device="cpu")[2]
+    down = centres + heights[:, None, None] * up
+    if _gap(object_.body.field, down, radius) < DRAG.clear:
+        return False
+    if object_.obstacles is None:
+        return True
+    path = torch.cat([down, centres + _shares()[:, None, None] * way])
+    return _gap(object_.obstacles.field, path, radius) >= DRAG.clear
+
+
+def _gap(field: DistanceField, path: Float[Tensor, "k s 3"], radius: Float[Tensor, "s"]) -> float:
+    """Return the least clearance [m] of spheres on a path from a field's surface."""
+    distance = field.query(path.to(field.nodes))[0].cpu()
+    return float((distance - radius.to(distance)).min())
