@@ -173,16 +173,16 @@ def lift_from_edge(
     if isinstance(mesh, GraspObject):
         parts = mesh.parts if parts is None else parts
         mesh = mesh.mesh
-    mesh, parts = read_solid(read_mesh(mesh), parts)
+    solid, pieces = read_solid(read_mesh(mesh), parts)
     table = good.table if table is None else table
     drag = None
     if plan.drag is not None:
-        drag = drag_object(plan.drag, hand, mesh, spec, seed, parts=parts, table=table)
+        drag = drag_object(plan.drag, hand, solid, spec, seed, parts=pieces, table=table)
         if drag.status is not Status.OK:
             return EdgeLift(drag, ())
         motion = drag.motion.numpy()
-        mesh, *parts = (x.copy().apply_transform(motion) for x in (mesh, *parts))
-    truth = Truth(mesh, parts, table=table)
+        solid, *pieces = (x.copy().apply_transform(motion) for x in (solid, *pieces))
+    truth = Truth(solid, pieces, table=table)
     trial = GraspTrial(hand, good, truth, seed, surface=surface_field(plan.shape))
     return EdgeLift(drag, lift_grasps(trial, spec, tries))
 
