@@ -15,6 +15,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Positive
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Urdf, read_urdf
 
@@ -297,6 +298,17 @@ class Slide(NamedTuple):
     lower: float
     upper: float
     start: float
+
+
+def edge_of(table: Plane) -> tuple[float, float, float] | None:
+    """Return the edge of a table that is level in the world's frame, as `SceneSpec` takes it; None
+    without one.
+    """
+    if table.edge is None:
+        return None
+    x, y, _ = table.edge.normal.tolist()
+    length = math.hypot(x, y)
+    return x / length, y / length, table.edge.offset
 
 
 def mounted_urdf(spec: SceneSpec) -> str:
