@@ -319,14 +319,16 @@ def frame_camera(
     return Camera(center + back * distance, frame, float(np.deg2rad(FRAMING.angle)))
 
 
-def _cut_off(vertices: Points, faces: np.ndarray, edge: Plane | None) -> tuple[Points, np.ndarray]:
-    """Return vertices (n, 3) [m] and faces (t, 3) of the part of a mesh that is behind an edge."""
+def _cut_off(
+    vertices: Points, faces: np.ndarray, edge: Plane | None
+) -> tuple[Float[np.ndarray, "v 3"], np.ndarray]:
+    """Return vertices (v, 3) [m] and faces (t, 3) of the part of a mesh that is behind an edge."""
     if edge is None:
         return vertices, faces
     inward = -np.array(edge.normal.tolist())
-    return trimesh.intersections.slice_faces_plane(vertices, faces, inward, -edge.offset * inward)[
-        :2
-    ]
+    on = -edge.offset * inward
+    kept, left, *_ = trimesh.intersections.slice_faces_plane(vertices, faces, inward, on)
+    return kept, left
 
 
 def sharp_normals(
