@@ -1,5 +1,6 @@
 """The simulated scene against statics, rigid-body formulae and the hand's own kinematics."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -310,6 +311,8 @@ def test_a_table_with_an_edge_is_a_box_around_all_that_is_near(offset):
     boxed = (np.abs((near - ledge.centre) @ ledge.axes) < ledge.half).all(1)
     assert np.array_equal(boxed, (near[:, 2] < 0.2) & (near[:, :2] @ AWAY < offset))
     assert offset > 1.0 or not boxed.all()
+    with pytest.raises(BadArgument, match=r"edge: .*a vector of length 2"):
+        dataclasses.replace(spec, edge=(0.0, 2.0, offset))
 
 
 def test_only_vertices_behind_the_edge_are_moved_up_to_the_table():

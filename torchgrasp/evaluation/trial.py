@@ -34,7 +34,7 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.convex_parts import read_solid
-from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
+from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec, edge_of
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 from torchgrasp.sim.simulated_scene import SimulatedScene
 from torchgrasp.values.closing import SensorModel
@@ -224,11 +224,7 @@ class TrialDriver:
             return None
         if trial.truth.table is None:
             table = level_table(trial.grasp, trial.truth)
-        edge = table.moved(inverse(self.obj_from_world)).edge
-        assert edge is not None
-        x, y, _ = rounded(edge.normal).tolist()
-        length = math.hypot(x, y)
-        return x / length, y / length, round(edge.offset, TRIALS.decimals)
+        return edge_of(_rounded_table(table.moved(inverse(self.obj_from_world))))
 
     def _body(self, given: Truth | Neighbour, mass: float | None = None) -> Body:
         """Return a mesh as a body of the scene: in the simulator's frame, with its convex parts and

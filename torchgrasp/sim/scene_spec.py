@@ -15,6 +15,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Positive
+from torchgrasp.geometry.plane import UNIT_ERROR, Plane
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Urdf, read_urdf
 
@@ -136,6 +137,8 @@ class SceneSpec:
             means `friction`.
         mount: all prismatic joints of the mount, each a `Slide`, from the world to the hand. None
             means those that `travel`, `approach` and `yields` need.
+
+    Raises `BadArgument` for an edge whose vector is not of unit length.
     """
 
     urdf_path: Path | str
@@ -161,6 +164,13 @@ class SceneSpec:
     table_friction: float | None = None
     mount: "tuple[Slide, ...] | None" = None
     edge: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.edge is None:
+            return
+        length = math.hypot(*self.edge[:2])
+        if not abs(length - 1) < UNIT_ERROR:
+            raise BadArgument("edge", f"a vector of length {length:g}", "a unit vector (x, y)")
 
     @functools.cached_property
     def urdf(self) -> Urdf:
@@ -297,6 +307,17 @@ class Slide(NamedTuple):
     lower: float
     upper: float
     start: float
+
+
+def edge_of(table: Plane) -> tuple[float, float, float] | None:
+    """Return the edge of a table that is level in the world's frame, as `SceneSpec` takes it; None
+    without one.
+    """
+    if table.edge is None:
+        return None
+    x, y, _ = table.edge.normal.tolist()
+    length = math.hypot(x, y)
+    return x / length, y / length, table.edge.offset
 
 
 def mounted_urdf(spec: SceneSpec) -> str:
