@@ -53,6 +53,8 @@ class DragTrialNumbers:
     """Fall [m] of the object's centre of mass, or"""
     tipped: float = math.radians(10)
     """turn [rad] of its vertical, from which it has fallen off the table."""
+    slipped: float = 0.02
+    """Distance [m] from the planned place beyond which the tips slid over the object."""
     decimals: int = 9
     """Decimals to which the table's edge [m] is rounded."""
 
@@ -67,7 +69,8 @@ class DragResult(Value):
 
     Attributes:
         status: `OK`; `NO_CONTACT` if the hand could not press; `DROPPED` if the object fell off the
-            table; `START_OVERLAP` or `UNSTABLE` as in `close_hand`.
+            table; `SLIPPED` if it is more than 20 mm (`TRIAL.slipped`) from where the plan wanted
+            it; `START_OVERLAP` or `UNSTABLE` as in `close_hand`.
         motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform.
         missed: distance [m] of the object's centre from where the plan wanted it.
         forces: sum (t,) [N] of the true normal forces of the fingertips at each control tick.
@@ -279,11 +282,14 @@ class _Drag:
                 status = Status.UNSTABLE
             elif after[2] < before[2] - TRIAL.fallen or moved[2, 2] < math.cos(TRIAL.tipped):
                 status = Status.DROPPED
+        missed = float(norm(after - before - wanted))
+        if status is Status.OK and missed > TRIAL.slipped:
+            status = Status.SLIPPED
         motion = self.obj_from_world @ moved @ world_from_obj
         return DragResult(
             status,
             motion,
-            float(norm(after - before - wanted)),
+            missed,
             torch.tensor(forces, dtype=torch.float64),
         )
 
