@@ -25,10 +25,12 @@ from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.geometry.signed_distance import DistanceField
 from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.clearance import Obstacles
 from torchgrasp.ik.press import PressPostures, press_postures
 from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.run import plan_shaped
+from torchgrasp.scene.occupancy import OCCUPANCY
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values.distribution import Distribution
@@ -63,7 +65,9 @@ class DragNumbers:
     flat: float = 0.003
     """Largest difference [m] of heights on this circle."""
     near: float = 0.0025
-    """Largest horizontal distance [m] of a point on the top from a vertex of it."""
+    """Largest horizontal distance [m] of a point on the top from the middle of a triangle; in a
+    coarse mesh, that of the triangle's own corners.
+    """
     clear: float = 0.003
     """Least clearance [m] of all other links from the object and the table."""
     lowered: int = 6
@@ -78,8 +82,17 @@ class DragNumbers:
     """Greatest gain of pressing force for each newton of the drag: then the tips would jam."""
     reserve: float = 3.0
     """Ratio of the pressing force to the least one that moves the object."""
+    least: float = 1.0
+    """Least pressing force [N]: sensors are off by 0.1 N."""
     most: float = 20.0
     """Greatest pressing force [N]: thin things bend, and hands are weak."""
+    enough: float = 1.5
+    """Least ratio of the pressing force to the least one, for an object that needs more than `most`.
+    """
+    sure: float = 0.1
+    """Probability that friction is less than the one that the drag counts on."""
+    sunk: float = 0.005
+    """Greatest depth [m] of a pressing tip in the estimated shape: estimates are a few mm off."""
     shortest: float = 0.002
     """Length [m] of a drag that is not worth while: sensors are off by as much."""
 
@@ -102,6 +115,8 @@ class DragPlan(Value):
         displacement: displacement (3,) [m] of hand and object along the table.
         force: sum of the normal forces [N] of the pressing fingers.
         table: the table.
+
+    Tensors of a plan are in float64 on the CPU.
     """
 
     joints: Float[Tensor, "h"]
@@ -123,8 +138,9 @@ class EdgePlan(Value):
         grasps: grasps of the object after the drag, or of the object where it stands without one.
             They are in the frame of the cloud, the best first, as those of `plan_grasps`.
         shape: the estimated shape after the drag, in the same frame.
-        reason: why there is no drag: the object hangs over the edge far enough, or no posture of
-            the hand can press on it, or a neighbour is in its way. Empty if there is a drag.
+        reason: why there is no drag: the object hangs over the edge far enough, or is too heavy, or
+            no posture of the hand can press on it, or a neighbour is in its way. Or the edge is too
+            far for what the camera saw of a scene. Empty if there is a drag.
     """
 
     drag: DragPlan | None
@@ -150,16 +166,20 @@ def plan_edge_grasps(
     Args:
         cloud: points that a camera saw [m], as for `plan_grasps`.
         hand: the hand, or its name or folder.
-        spec: constraints. Its `table` must be a plane with an `edge` (`Plane.ending`).
+        spec: constraints. Its `table` must be a plane with an `edge` (`Plane.ending`). Its region
+            is where the object lies before the drag, and moves with it. The drag counts on the tenth
+            quantile of its friction (`DRAG.sure`), if that is a distribution.
         starts: number of random initial guesses of the contact planner.
         seed: random seed.
-        task: what grasps must do; None means `GraspTask()`.
+        task: what grasps must do; None means `GraspTask()`. The greatest mass of a distribution is
+            dragged.
         table_friction: coefficient of friction between object and table. The pressing force is
             three times (`DRAG.reserve`) the least one that moves the object (Coulomb's law).
 
     Raises:
-        BadArgument: a table without an edge; an object whose centre is beyond the edge; a friction
-            of the fingertips that is not greater than `table_friction`.
+        BadArgument: a table without an edge, or one whose edge is more than 12 mm (`DRAG.behind`)
+            behind the object's estimated centre of mass: the object would fall.
+        BadArgument: a friction of the fingertips that is not greater than `table_friction`.
 
     >>> import torch
     >>> from torchgrasp import load_hand, load_object
@@ -172,69 +192,99 @@ def plan_edge_grasps(
     if table is None or table.edge is None:
         found = "no table" if table is None else "a table without an edge"
         raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
-    if not spec.mean_friction > table_friction:
-        found = f"{table_friction:g}, and {spec.mean_friction:g} of the fingertips"
+    sure = torch.tensor(DRAG.sure, dtype=torch.float64)
+    friction = float(Distribution.of(spec.friction).quantile(sure))
+    if not friction > table_friction:
+        found = f"{table_friction:g}, and {friction:g} of the fingertips"
         raise BadArgument("table_friction", found, "less than the friction of the fingertips")
     hand = as_hand(hand, "hand")
     request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
     object_ = ShapedObject.of(request)
     shape = object_.shape.moved(object_.obj_from_upright)
     length = _length(object_, table)
-    if length <= DRAG.shortest:
-        reason = "the object hangs over the edge as far as it can"
-        return EdgePlan(None, plan_shaped(object_, request), shape, reason)
+    if length < -2 * DRAG.behind:
+        found = f"an edge {-1e3 * (length + DRAG.behind):.0f} mm behind the object's centre"
+        raise BadArgument("spec.table", found, "an edge beyond it")
     mass = Distribution.of(request.grasp_task.mass).most
-    force = _force(mass, spec.mean_friction, table_friction)
-    drag = _find_drag(object_, hand, table, length, force)
-    if drag is None:
-        reason = "no posture presses on the object from above, or a neighbour is in its way"
-        return EdgePlan(None, plan_shaped(object_, request), shape, reason)
+    drag = _find_drag(object_, hand, table, length, mass, friction, table_friction)
+    if isinstance(drag, str):
+        return EdgePlan(None, plan_shaped(object_, request), shape, drag)
     # for the object, the edge comes nearer
     shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
     nearer = dataclasses.replace(table, edge=table.edge.moved(inverse(shift)))
-    grasps = plan_shaped(dataclasses.replace(object_, table=nearer), request)
+    obstacles = _brought(object_, drag.displacement)
+    object_ = dataclasses.replace(object_, table=nearer, obstacles=obstacles)
+    grasps = plan_shaped(object_, request)
     grasps = move(grasps, shift)
     grasps = dataclasses.replace(grasps, meta={**grasps.meta, "table": table.describe()})
     return EdgePlan(drag, grasps, shape.moved(shift))
 
 
 def _length(object_: ShapedObject, table: Plane) -> float:
-    """Return how far [m] the object must be dragged, so that its centre of mass is `DRAG.behind` behind
-    the edge.
+    """Return how far [m] the object must be dragged, so that its centre of mass is `DRAG.behind`
+    behind the edge. It is negative if the centre is nearer to the edge, or beyond it.
     """
     assert table.edge is not None
     centre = apply(object_.obj_from_upright, object_.body.center.cpu().double()[None])[0]
     return -float(table.edge.height(centre)) - DRAG.behind
 
 
-def _force(mass: float, friction: float, table_friction: float) -> float:
-    """Return the pressing force [N] that drags an object of a `mass` [kg] (Coulomb's law).
+def _brought(object_: ShapedObject, displacement: Float[Tensor, "3"]) -> Obstacles | None:
+    """Return the obstacles as the object finds them after a `displacement` [m]: they have come the
+    other way.
+    """
+    if object_.obstacles is None:
+        return None
+    field = object_.obstacles.field
+    way = inverse(object_.obj_from_upright)[:3, :3] @ displacement
+    field = dataclasses.replace(field, origin=field.origin - way.to(field.origin))
+    return dataclasses.replace(object_.obstacles, field=field)
+
+
+def _force(mass: float, friction: float, table_friction: float) -> float | None:
+    """Return the pressing force [N] that drags an object of a `mass` [kg] (Coulomb's law); None if
+    the object is too heavy.
 
     A force N moves it if the fingers' friction N is at least the table's friction times N plus the
     weight.
     """
     weight = mass * GRAVITY
     least = table_friction * weight / (friction - table_friction)
-    return min(max(DRAG.reserve * least, weight), DRAG.most)
+    if DRAG.enough * least > DRAG.most:
+        return None
+    return min(max(DRAG.reserve * least, weight, DRAG.least), DRAG.most)
 
 
 def _find_drag(
-    object_: ShapedObject, hand: Hand, table: Plane, length: float, force: float
-) -> DragPlan | None:
-    """Return the drag of a `length` [m] with the best posture that presses on the object; None if
-    there is none.
+    object_: ShapedObject,
+    hand: Hand,
+    table: Plane,
+    length: float,
+    mass: float,
+    friction: float,
+    table_friction: float,
+) -> DragPlan | str:
+    """Return the drag of a `length` [m] with the best posture that presses on the object, or the
+    reason why there is none.
     """
     assert table.edge is not None
+    if length <= DRAG.shortest:
+        return "the object hangs over the edge as far as it can"
+    force = _force(mass, friction, table_friction)
+    if force is None:
+        return f"an object of {mass:g} kg is too heavy to drag"
+    if object_.scene is not None and length > OCCUPANCY.sideways:
+        return f"the camera's scene is known only {OCCUPANCY.sideways:g} m around the object"
+    postures = press_postures(hand)
     hand = hand.to("cpu", torch.float64)
     frame = object_.obj_from_upright
-    outward = table.edge.normal.double()
-    postures = press_postures(hand)
+    outward = table.edge.normal.cpu().double()
     way = length * (inverse(frame)[:3, :3] @ outward)
     if not _is_free(object_, way):
-        return None
+        return "a neighbour is in the object's way to the edge"
     found = _place(object_, hand, postures, way, force)
     if found is None:
-        return None
+        return "no posture of the hand presses on the object from above, clear of all else"
     at, upright_from_press = found
     obj_from_press = frame @ upright_from_press
     presses = postures.presses[at]
@@ -313,14 +363,19 @@ def _turns(angles: Float[Tensor, "t"]) -> Float[Tensor, "t 3 3"]:
 
 
 class _Top:
-    """The top of an object: the vertices [m] of its surface whose normals point up."""
+    """The top of an object: the triangles of its surface whose normals point up.
 
-    def __init__(self, vertices: Float[Tensor, "v 3"]) -> None:
+    `corners` (v, 3, 3) [m] are those of these triangles.
+    """
+
+    def __init__(self, corners: Float[Tensor, "v 3 3"]) -> None:
         from scipy.spatial import KDTree
 
-        self.points = vertices
-        self.height = vertices[:, 2]
-        self.tree = KDTree(vertices[:, :2].numpy())
+        self.points = corners.mean(1)
+        self.height = self.points[:, 2]
+        reach = norm((corners - self.points[:, None])[..., :2]).amax(1)
+        self.near = reach.clamp_min(DRAG.near)
+        self.tree = KDTree(self.points[:, :2].numpy())
         angles = torch.arange(DRAG.ring, device="cpu").double() * (2 * math.pi / DRAG.ring)
         ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
         self.around = torch.cat([ring.new_zeros(1, 2), ring])  # (k, 2)
@@ -345,8 +400,9 @@ class _Top:
         """
         places = feet[..., None, :2] + self.around
         gap, index = self.tree.query(places.reshape(-1, 2).numpy())
-        height = self.height[torch.from_numpy(index)].reshape(places.shape[:-1])
-        near = torch.from_numpy(gap).reshape(places.shape[:-1]) <= DRAG.near
+        index = torch.from_numpy(index)
+        height = self.height[index].reshape(places.shape[:-1])
+        near = (torch.from_numpy(gap) <= self.near[index]).reshape(places.shape[:-1])
         low, high = height.aminmax(dim=-1)
         return height[..., 0], near.all(-1) & (high - low <= DRAG.flat)
 
@@ -359,7 +415,7 @@ def _top(object_: ShapedObject) -> _Top:
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = torch.linalg.vector_norm(normals, dim=-1).clamp_min(torch.finfo(normals.dtype).tiny)
     upward = normals[:, 2] > DRAG.upward * size
-    return _Top(corners[upward].mean(1))
+    return _Top(corners[upward])
 
 
 def _is_free(object_: ShapedObject, way: Float[Tensor, "3"]) -> bool:
@@ -396,8 +452,12 @@ def _is_clear(
     spheres = hand.collision_spheres
     pressing = flatnonzero(postures.presses[at])
     tips = spheres.touching & torch.isin(spheres.finger, pressing)
-    centres = apply(pose, postures.spheres[at])[~tips]
-    radius = spheres.radius.to(centres)[~tips]
+    centres = apply(pose, postures.spheres[at])
+    radius = spheres.radius.to(centres)
+    # under a handle, say, a tip would have to go through the object
+    if _gap(object_.body.field, centres[tips], radius[tips]) < -DRAG.sunk:
+        return False
+    centres, radius = centres[~tips], radius[~tips]
     if float((centres[:, 2] - radius).min()) < DRAG.clear:
         return False
     heights = torch.linspace(0, DRAG.approach, DRAG.lowered, dtype=torch.float64, device="cpu")
@@ -411,7 +471,7 @@ def _is_clear(
     return _gap(object_.obstacles.field, path, radius) >= DRAG.clear
 
 
-def _gap(field: DistanceField, path: Float[Tensor, "k s 3"], radius: Float[Tensor, "s"]) -> float:
+def _gap(field: DistanceField, path: Float[Tensor, "*k s 3"], radius: Float[Tensor, "s"]) -> float:
     """Return the least clearance [m] of spheres on a path from a field's surface."""
     distance = field.query(path.to(field.nodes))[0].cpu()
     return float((distance - radius.to(distance)).min())
