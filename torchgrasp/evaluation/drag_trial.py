@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torchgrasp.control.drag import DRAGGING, DragController
 from torchgrasp.control.finger_forces import drive_stiffness, stiff_drives
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.data.shipped import GraspObject
-from torchgrasp.evaluation.frame import moved_mesh, world_frame
+from torchgrasp.evaluation.frame import moved_mesh, rounded, world_frame
 from torchgrasp.evaluation.protocols import draw_trial
 from torchgrasp.evaluation.several_tries import LiftTry, lift_grasps
 from torchgrasp.evaluation.trial import GraspTrial, Truth
@@ -24,17 +24,18 @@ from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.foundation.rules import Count, Pose, Seed
+from torchgrasp.foundation.rules import ANY, Count, Measured, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
-from torchgrasp.planner.edge import DragPlan, EdgePlan
+from torchgrasp.planner.drag_plan import DragPlan
+from torchgrasp.planner.edge import EdgePlan
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import read_solid
-from torchgrasp.sim.scene_spec import SceneSpec
+from torchgrasp.sim.scene_spec import SceneSpec, edge_of
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 from torchgrasp.values.closing import ClosingGains, SensorModel
 from torchgrasp.values.distribution import Distribution
@@ -47,16 +48,14 @@ class DragTrialNumbers:
 
     rest: float = 0.5
     """Time [s] after the drag in which the object comes to rest."""
-    longest: float = 30.0
-    """Time [s] after which a drag is ended."""
-    fallen: float = 0.01
-    """Fall [m] of the object's centre of mass, or"""
+    below: float = 0.005
+    """Depth [m] of the object's lowest point below the table from which it falls over the edge."""
     tipped: float = math.radians(10)
-    """turn [rad] of its vertical, from which it has fallen off the table."""
+    """Turn [rad] of the object's vertical from which it has toppled."""
     slipped: float = 0.02
     """Distance [m] from the planned place beyond which the tips slid over the object."""
     decimals: int = 9
-    """Decimals to which the table's edge [m] is rounded."""
+    """Decimals to which offsets [m] of the table and its edge are rounded."""
 
 
 TRIAL = DragTrialNumbers()
@@ -68,18 +67,21 @@ class DragResult(Value):
     """The record of a simulated drag.
 
     Attributes:
-        status: `OK`; `NO_CONTACT` if the hand could not press; `DROPPED` if the object fell off the
-            table; `SLIPPED` if it is more than 20 mm (`TRIAL.slipped`) from where the plan wanted
-            it; `START_OVERLAP` or `UNSTABLE` as in `close_hand`.
-        motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform.
-        missed: distance [m] of the object's centre from where the plan wanted it.
+        status: `OK`; `NO_CONTACT` if the hand could not press, or lost the object on the way;
+            `DROPPED` if the object toppled, or hangs or fell over the edge; `SLIPPED` if it is
+            more than 20 mm (`TRIAL.slipped`) from where the plan wanted it; `START_OVERLAP` or
+            `UNSTABLE` as in `close_hand`.
+        motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform; NaN if
+            the drag is `UNSTABLE`.
+        missed: distance [m] of the object's centre of mass from where the plan wanted it; NaN in
+            the same case.
         forces: sum (t,) [N] of the true normal forces of the fingertips at each control tick.
     """
 
     status: Status
-    motion: Pose
-    missed: float
-    forces: Float[Tensor, "t"]
+    motion: Annotated[Float[Tensor, "4 4"], ANY]
+    missed: Measured
+    forces: Annotated[Float[Tensor, "t"], ANY]
 
 
 @checked
@@ -109,7 +111,9 @@ def drag_object(
         table: the true table, with its edge. None means that of the plan.
 
     Raises:
-        BadArgument: a plan of another hand, or a mesh that does not stand on the table.
+        BadArgument: a plan that `DragController` refuses, or a mesh that does not stand on the
+            table.
+        BadArgument: a sensor that measures no force, at all or at a finger that presses.
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
     """
@@ -120,7 +124,18 @@ def drag_object(
     table = plan.table if table is None else table
     check_stand(solid, table)
     spec = draw_trial(TrialSpec() if spec is None else spec, seed)
+    _check_sensor(spec.sensor, plan, hand)
     return _Drag(plan, hand.to("cpu", torch.float64), solid, parts, table, spec, seed).complete()
+
+
+def _check_sensor(sensor: SensorModel, plan: DragPlan, hand: Hand) -> None:
+    """Raise `BadArgument` if a pressing finger has no sensor of forces."""
+    if sensor.kind == "binary":
+        raise BadArgument("spec.sensor", "'binary' sensors", "sensors that measure forces")
+    names = [name for name, on in zip(hand.finger_names, plan.presses.tolist(), strict=False) if on]
+    dead = [name for name in names if name in sensor.dead]
+    if dead:
+        raise BadArgument("spec.sensor", f"dead fingers {dead}", "forces of the fingers that press")
 
 
 class EdgeLift(NamedTuple):
@@ -203,25 +218,26 @@ class _Drag:
         spec: TrialSpec,
         seed: int,
     ) -> None:
-        pose = plan.obj_from_hand.double()
+        self.obj_from_world = world_frame(table, plan.obj_from_hand.to("cpu", torch.float64))
+        plan = _in_world(plan, inverse(self.obj_from_world))
         self.plan = plan
         self.spec = spec
-        self.obj_from_world = world_frame(table, pose)
         mesh, parts = read_solid(mesh, parts)
+        density = spec.density
+        mass = Distribution.of(spec.mass).mean if density is None else density * float(mesh.volume)
         solid, *pieces = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
         self.controller = DragController(plan, hand)
-        world_from_hand = inverse(self.obj_from_world) @ pose
-        start = world_from_hand[:3, :3] @ self.controller.targets.palm
-        joints = {name: float(q) for name, q in hand.expand(plan.joints.double()).items()}
+        start = plan.obj_from_hand[:3, :3] @ self.controller.targets.palm
+        joints = {name: float(q) for name, q in hand.expand(plan.joints).items()}
         scene_spec = SceneSpec(
             urdf_path=hand.urdf_path,
-            world_from_hand=world_from_hand.numpy(),
+            world_from_hand=plan.obj_from_hand.numpy(),
             joints=joints,
             drives=stiff_drives(hand, spec.kp),
             tip_links=tuple(hand.tips.links),
             mesh=solid,
             parts=pieces,
-            mass=Distribution.of(spec.mass).mean,
+            mass=mass,
             friction=Distribution.of(spec.friction).mean,
             table_friction=spec.table_friction,
             gravity=spec.gravity,
@@ -236,6 +252,7 @@ class _Drag:
             + DRAGGING.deepest,
             start=tuple(start.tolist()),
         )
+        self.vertices = np.asarray(solid.vertices)
         self.scene = open_scene(scene_spec, spec.simulator)
         generator = torch.Generator().manual_seed(seed) if spec.noise else None
         self.robot = SimulatedHand(
@@ -245,12 +262,7 @@ class _Drag:
 
     def _edge(self, table: Plane) -> tuple[float, float, float] | None:
         """Return the table's edge in the simulator's frame."""
-        edge = table.moved(inverse(self.obj_from_world)).edge
-        if edge is None:
-            return None
-        x, y, _ = edge.normal.tolist()
-        length = math.hypot(x, y)
-        return x / length, y / length, round(edge.offset, TRIAL.decimals)
+        return edge_of(_rounded_table(table.moved(inverse(self.obj_from_world))))
 
     def complete(self) -> DragResult:
         """Run the drag; return its record."""
@@ -259,9 +271,7 @@ class _Drag:
         if self.overlap > self.spec.overlap:
             return self._result(Status.START_OVERLAP, start, forces)
         observation = self.robot.tick(self.controller.targets)
-        for _ in range(self.robot.ticks(TRIAL.longest)):
-            if self.controller.phase == "done":
-                break
+        while self.controller.phase != "done":  # the controller ends every phase
             targets = self.controller.step(observation, self.robot.period)
             observation = self.robot.tick(targets)
             forces.append(float(self.robot.force.sum()))
@@ -275,17 +285,17 @@ class _Drag:
         centre = torch.from_numpy(self.scene.centre)
         before = apply(torch.from_numpy(start), centre[None])[0]
         after = apply(torch.from_numpy(pose), centre[None])[0]
-        world_from_obj = inverse(self.obj_from_world)
-        wanted = world_from_obj[:3, :3] @ self.plan.displacement.double()
-        if status is Status.OK:
-            if not bool(torch.isfinite(moved).all()):
-                status = Status.UNSTABLE
-            elif after[2] < before[2] - TRIAL.fallen or moved[2, 2] < math.cos(TRIAL.tipped):
+        wanted = self.plan.displacement
+        if not bool(torch.isfinite(moved).all()):
+            status = Status.UNSTABLE
+        elif status is Status.OK:
+            vertices = moved[2, :3].numpy() @ self.vertices.T + float(moved[2, 3])
+            if vertices.min() < -TRIAL.below or moved[2, 2] < math.cos(TRIAL.tipped):
                 status = Status.DROPPED
         missed = float(norm(after - before - wanted))
         if status is Status.OK and missed > TRIAL.slipped:
             status = Status.SLIPPED
-        motion = self.obj_from_world @ moved @ world_from_obj
+        motion = self.obj_from_world @ moved @ inverse(self.obj_from_world)
         return DragResult(
             status,
             motion,
@@ -294,21 +304,43 @@ class _Drag:
         )
 
 
+def _in_world(plan: DragPlan, world_from_obj: Float[Tensor, "4 4"]) -> DragPlan:
+    """Return a drag in the simulator's frame, in float64 on the CPU.
+
+    Its numbers are rounded, so that the frame of the plan does not change the trial.
+    """
+    plan = plan.to("cpu", torch.float64)
+    turn = world_from_obj[:3, :3]
+    return dataclasses.replace(
+        plan,
+        obj_from_hand=rounded(world_from_obj @ plan.obj_from_hand),
+        feet=rounded(apply(world_from_obj, plan.feet)),
+        displacement=rounded(turn @ plan.displacement),
+        table=_rounded_table(plan.table.moved(world_from_obj)),
+    )
+
+
+def _rounded_table(table: Plane) -> Plane:
+    """Return a table whose numbers, and those of its edge, are rounded."""
+    edge = None if table.edge is None else _rounded_table(table.edge)
+    return Plane(rounded(table.normal), round(table.offset, TRIAL.decimals), edge)
+
+
 def _reference(hand: Hand, plan: DragPlan, spec: TrialSpec) -> ClosingReference:
     """Return what the fingertips' sensors need to know: the fingers touch from above."""
     f = len(hand.tips)
-    joints = plan.joints.double()
-    normals = (plan.table.normal.double() @ plan.obj_from_hand[:3, :3].double()).expand(f, 3)
+    joints = plan.joints
+    normals = (plan.table.normal @ plan.obj_from_hand[:3, :3]).expand(f, 3)
     still = torch.zeros(f, 3, dtype=torch.float64)
     gains = ClosingGains(still, torch.zeros(f, 3, 3, dtype=torch.float64), still, still, still)
     return ClosingReference(
         hand,
         drive_stiffness(hand, spec.kp),
-        obj_from_hand=plan.obj_from_hand.double(),
+        obj_from_hand=plan.obj_from_hand,
         pregrasp=joints,
         joints=joints,
         squeeze=joints,
         normals=normals.clone(),
         gains=gains,
-        sensor=spec.sensor or SensorModel(),
+        sensor=spec.sensor,
     )

@@ -17,7 +17,7 @@ from torchgrasp.foundation.rules import Seed
 from torchgrasp.geometry.frames import rigid
 from torchgrasp.geometry.linalg import across, eye_like, fibonacci_sphere, norm, unit
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.seeds import PostureLibrary
+from torchgrasp.posture_model.sample import sample_configurations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +31,7 @@ class PressNumbers:
     level: float = 0.003
     """Largest difference [m] of the heights of two tips; the hand is then turned to level them."""
     gap: float = 0.006
-    """Least distance [m] by which all other links are higher than the pressing tips."""
+    """Least distance [m] by which all else of the hand is higher than the pressing tips."""
     cosine: float = 0.5
     """Least cosine between a pad's axis and the direction of pressing: its cone has 60 degrees."""
     apart: float = 0.02
@@ -44,6 +44,8 @@ class PressNumbers:
     """Compliance [m/N] of gears and links, which every fingertip has in all directions."""
     kept: int = 200
     """Number of postures that are kept."""
+    chunk: int = 50
+    """Number of postures whose links are projected at a time, to bound the memory."""
 
 
 PRESS = PressNumbers()
@@ -88,8 +90,10 @@ class PressPostures(Value):
 def press_postures(hand: Hand, seed: Seed = 0) -> PressPostures:
     """Return the pressing postures of a hand, found among random postures drawn from `seed`.
 
-    At most 200 (`PRESS.kept`) are returned, and none if no posture presses. The result is cached
-    in `hand.derived`.
+    At most 200 (`PRESS.kept`) are returned, and none if no posture presses. They are in float64 on
+    the CPU. The result is cached in `hand.derived`.
+
+    Raises the errors of `sample_configurations`.
 
     >>> from torchgrasp import load_hand
     >>> found = press_postures(load_hand("allegro"))
@@ -98,23 +102,27 @@ def press_postures(hand: Hand, seed: Seed = 0) -> PressPostures:
     """
     key = (PressPostures, seed)
     if key not in hand.derived:
-        hand.derived[key] = _search(hand, seed)
+        hand.derived[key] = _search(hand.to("cpu", torch.float64), seed)
     return hand.derived[key]
 
 
 def _search(hand: Hand, seed: int) -> PressPostures:
     """Return the pressing postures; each random posture gives at most one, in its best direction."""
-    library = PostureLibrary.of(hand, seed=seed)
-    joints = library.joints[: PRESS.postures]
+    joints = sample_configurations(hand, PRESS.postures, seed).joints
     centres = hand.tip_centres(joints)
-    radius = hand.tips.radius.to(centres)
+    radius = hand.tips.radius
     _, pads = hand.fingertips(joints)
-    spheres = hand.sphere_centres(joints)
     around = hand.collision_spheres
+    links = hand.sphere_centres(joints)[:, ~around.touching]
     directions = fibonacci_sphere(PRESS.directions).to(centres)
     # how far everything reaches in each direction: (s, d, f) and (s, d)
     reach = directions @ centres.mT + radius
-    links = (directions @ spheres[:, ~around.touching].mT + around.radius[~around.touching]).amax(2)
+    links = torch.cat(
+        [
+            (directions @ some.mT + around.radius[~around.touching]).amax(2)
+            for some in links.split(PRESS.chunk)
+        ]
+    )
     facing = directions @ pads.mT > PRESS.cosine
     presses = facing & (reach > reach.amax(2, keepdim=True) - PRESS.level)
     presses &= presses.sum(2, keepdim=True) <= 2
@@ -165,8 +173,10 @@ def _gap(
     around = hand.collision_spheres
     radius = hand.tips.radius.to(down)
     reach = (hand.tip_centres(joints) @ down[..., None])[..., 0] + radius
-    spheres = hand.sphere_centres(joints)[:, ~around.touching]
-    links = ((spheres @ down[..., None])[..., 0] + around.radius[~around.touching]).amax(1)
+    spheres = hand.sphere_centres(joints)
+    own = around.touching & presses[:, around.finger.clamp_min(0)]
+    links = (spheres @ down[..., None])[..., 0] + around.radius
+    links = torch.where(own, -math.inf, links).amax(1)
     lowest = torch.where(presses, reach, math.inf).amin(1)
     others = torch.where(presses, -math.inf, reach).amax(1)
     return lowest - torch.maximum(links, others)

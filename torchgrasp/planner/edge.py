@@ -7,25 +7,29 @@ fingers then pinch this part from above and below.
 """
 
 import dataclasses
-import math
 from typing import Annotated
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.data.accept import HandLike, SeenLike, as_hand, as_seen
-from torchgrasp.foundation.base import Value, flatnonzero
+from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import ANY, Count, Pose, Range, Seed
+from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
-from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
-from torchgrasp.geometry.linalg import norm, unit
+from torchgrasp.geometry.frames import apply, inverse, rigid
 from torchgrasp.geometry.plane import Plane, move
-from torchgrasp.geometry.signed_distance import DistanceField
-from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.press import PressPostures, press_postures
+from torchgrasp.ik.clearance import Obstacles
+from torchgrasp.planner.drag_plan import (
+    DRAG,
+    GRAVITY,
+    DragPlan,
+    centre_of_mass,
+    find_drag,
+    length_to_edge,
+)
 from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.run import plan_shaped
@@ -34,97 +38,6 @@ from torchgrasp.success.task import GraspTask, TaskWrenches
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ContactSpec
-
-GRAVITY = 9.81  # acceleration [m/s^2]
-
-
-@dataclasses.dataclass(frozen=True)
-class DragNumbers:
-    """Parameters of a drag to the edge."""
-
-    behind: float = 0.015
-    """Distance [m] behind the edge at which the centre of mass ends: its estimate is 5 mm off."""
-    supported: float = 0.004
-    """Least distance [m] behind the edge of each pressing tip at the end of the drag."""
-    spacing: float = 0.008
-    """Distance [m] of the places on the object's top where the hand may press."""
-    cell: float = 0.001
-    """Spacing [m] of the map of the object's top."""
-    places: int = 60
-    """Number of these places that are tried, those nearest to the centre of mass."""
-    postures: int = 40
-    """Number of postures of two tips, and of one, that are tried at each place."""
-    turns: int = 24
-    """Number of directions about the vertical in which each posture is tried."""
-    upward: float = 0.9
-    """Least upward part of the unit normal where a tip presses: 25 degrees."""
-    rim: float = 0.002
-    """Distance [m] of a pressing tip from the object's outline."""
-    ring: int = 8
-    """Number of points on the circle of radius `rim` that must lie on the object's top."""
-    flat: float = 0.003
-    """Largest difference [m] of heights on this circle."""
-    near: float = 0.0025
-    """Largest horizontal distance [m] of a point on the top from a vertex of it."""
-    clear: float = 0.003
-    """Least clearance [m] of all other links from the object and the table."""
-    aside: tuple[float, ...] = (0.0, 30.0, -30.0, 60.0, -60.0)
-    """Angles [deg] between the drag and the shortest way to the edge, in the order of trial."""
-    lowered: int = 6
-    """Number of heights at which the hand is checked on its way down."""
-    approach: float = 0.05
-    """Height [m] from which the hand comes down."""
-    steps: int = 8
-    """Number of places on the way along the table at which hand and object are checked."""
-    unloading: float = 0.2
-    """Greatest loss of pressing force for each newton of the drag: then the tips would slip."""
-    digging: float = 0.8
-    """Greatest gain of pressing force for each newton of the drag: then the tips would jam."""
-    reserve: float = 3.0
-    """Ratio of the pressing force to the least one that moves the object."""
-    weights: float = 2.0
-    """Least ratio of the pressing force to the weight: the tips then resist a turn."""
-    pivot: float = 0.004
-    """Largest distance [m] of the centre of mass from the line along which one tip drags."""
-    share: float = 0.25
-    """Share of the friction of two tips that is left to resist a turn."""
-    support: float = 0.005
-    """Distance [m] before and behind a pressing tip to which the top must reach: else it rolls."""
-    carried: float = 1.5
-    """Ratio of the load that grasps must resist to the weight: its lever is known to a third."""
-    most: float = 20.0
-    """Greatest pressing force [N]: thin things bend, and hands are weak."""
-    shortest: float = 0.002
-    """Length [m] of a drag that is not worth while: sensors are off by as much."""
-
-
-DRAG = DragNumbers()
-
-
-@checked
-@dataclasses.dataclass(frozen=True)
-class DragPlan(Value):
-    """How a hand drags an object along its table: it presses from above, and moves sideways.
-
-    Everything is in the frame of the cloud. f counts fingertips, and h actuated joints.
-
-    Attributes:
-        joints: actuated joints (h,) [rad or m] of the pressing hand; they stay the same.
-        obj_from_hand: pose (4, 4) [m] of the hand's root link where the tips touch the object.
-        presses: mask (f,) of the fingers that press.
-        feet: points (f, 3) [m] where the tips touch; NaN for fingers that do not press.
-        displacement: displacement (3,) [m] of hand and object along the table.
-        force: sum of the normal forces [N] of the pressing fingers.
-        table: the table.
-    """
-
-    joints: Float[Tensor, "h"]
-    obj_from_hand: Pose
-    presses: Bool[Tensor, "f"]
-    feet: Annotated[Float[Tensor, "f 3"], ANY]
-    displacement: Float[Tensor, "3"]
-    force: float
-    table: Plane
 
 
 @checked
@@ -137,8 +50,9 @@ class EdgePlan(Value):
         grasps: grasps of the object after the drag, or of the object where it stands without one.
             They are in the frame of the cloud, the best first, as those of `plan_grasps`.
         shape: the estimated shape after the drag, in the same frame.
-        reason: why there is no drag: the object hangs over the edge far enough, or no posture of
-            the hand can press on it, or a neighbour is in its way. Empty if there is a drag.
+        reason: why there is no drag: the object hangs over the edge far enough, or is too heavy, or
+            no posture of the hand can press on it, or a neighbour is in its way. Or the edge is too
+            far for what the camera saw of a scene. Empty if there is a drag.
     """
 
     drag: DragPlan | None
@@ -161,19 +75,26 @@ def plan_edge_grasps(
 ) -> EdgePlan:
     """Plan to drag the object to the edge of its table, and grasps there; return both.
 
+    The grasps resist half as much weight again (`DRAG.carried`), as with the argument `resist` of
+    `plan_grasps`.
+
     Args:
         cloud: points that a camera saw [m], as for `plan_grasps`.
         hand: the hand, or its name or folder.
-        spec: constraints. Its `table` must be a plane with an `edge` (`Plane.ending`).
+        spec: constraints. Its `table` must be a plane with an `edge` (`Plane.ending`). Its region
+            is where the object lies before the drag, and moves with it. The drag counts on the tenth
+            quantile of its friction (`DRAG.sure`), if that is a distribution.
         starts: number of random initial guesses of the contact planner.
         seed: random seed.
-        task: what grasps must do; None means `GraspTask()`.
+        task: what grasps must do; None means `GraspTask()`. The greatest mass of a distribution is
+            dragged.
         table_friction: coefficient of friction between object and table. The pressing force is
             three times (`DRAG.reserve`) the least one that moves the object (Coulomb's law).
 
     Raises:
-        BadArgument: a table without an edge; an object whose centre is beyond the edge; a friction
-            of the fingertips that is not greater than `table_friction`.
+        BadArgument: a table without an edge, or one whose edge is more than 15 mm (`DRAG.behind`)
+            behind the object's estimated centre of mass: the object would fall.
+        BadArgument: a friction of the fingertips that is not greater than `table_friction`.
 
     >>> import torch
     >>> from torchgrasp import load_hand, load_object
@@ -186,44 +107,35 @@ def plan_edge_grasps(
     if table is None or table.edge is None:
         found = "no table" if table is None else "a table without an edge"
         raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
-    if not spec.mean_friction > table_friction:
-        found = f"{table_friction:g}, and {spec.mean_friction:g} of the fingertips"
+    sure = torch.tensor(DRAG.sure, dtype=torch.float64)
+    friction = float(Distribution.of(spec.friction).quantile(sure))
+    if not friction > table_friction:
+        found = f"{table_friction:g}, and {friction:g} of the fingertips"
         raise BadArgument("table_friction", found, "less than the friction of the fingertips")
     hand = as_hand(hand, "hand")
     request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
-    mass = Distribution.of(request.grasp_task.mass).most
     object_ = ShapedObject.of(request)
     shape = object_.shape.moved(object_.obj_from_upright)
-    centre = _centre(object_)
-    length = _length(object_, centre, table)
+    centre = centre_of_mass(object_)
+    length = length_to_edge(object_, centre, table)
+    if length < -2 * DRAG.behind:
+        found = f"an edge {-1e3 * (length + DRAG.behind):.0f} mm behind the object's centre"
+        raise BadArgument("spec.table", found, "an edge beyond it")
+    mass = Distribution.of(request.grasp_task.mass).most
     load = _weight(mass, table, apply(object_.obj_from_upright, centre[None])[0])
     request = dataclasses.replace(request, resist=load)
-    if length <= DRAG.shortest:
-        reason = "the object hangs over the edge as far as it can"
-        return EdgePlan(None, plan_shaped(object_, request), shape, reason)
-    force = _force(mass, spec.mean_friction, table_friction)
-    # the torque of the weight's friction, over the friction that is left to two tips
-    lever = 2 * table_friction * mass * GRAVITY / (DRAG.share * spec.mean_friction * force)
-    drag = _find_drag(object_, hand, table, centre, length, force, lever)
-    if drag is None:
-        reason = "no posture presses on the object from above, or a neighbour is in its way"
-        return EdgePlan(None, plan_shaped(object_, request), shape, reason)
+    drag = find_drag(object_, hand, table, mass, friction, table_friction)
+    if isinstance(drag, str):
+        return EdgePlan(None, plan_shaped(object_, request), shape, drag)
     # for the object, the edge comes nearer
     shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
     nearer = dataclasses.replace(table, edge=table.edge.moved(inverse(shift)))
-    grasps = plan_shaped(dataclasses.replace(object_, table=nearer), request)
+    obstacles = _brought(object_, drag.displacement)
+    object_ = dataclasses.replace(object_, table=nearer, obstacles=obstacles)
+    grasps = plan_shaped(object_, request)
     grasps = move(grasps, shift)
     grasps = dataclasses.replace(grasps, meta={**grasps.meta, "table": table.describe()})
     return EdgePlan(drag, grasps, shape.moved(shift))
-
-
-def _length(object_: ShapedObject, centre: Float[Tensor, "3"], table: Plane) -> float:
-    """Return how far [m] the object must be dragged, so that its centre of mass is `DRAG.behind` behind
-    the edge.
-    """
-    assert table.edge is not None
-    in_cloud = apply(object_.obj_from_upright, centre[None])[0]
-    return -float(table.edge.height(in_cloud)) - DRAG.behind
 
 
 def _weight(mass: float, table: Plane, centre: Float[Tensor, "3"]) -> TaskWrenches:
@@ -236,276 +148,13 @@ def _weight(mass: float, table: Plane, centre: Float[Tensor, "3"]) -> TaskWrench
     return TaskWrenches(torch.cat([force, torch.zeros_like(force)])[None], centre)
 
 
-def _force(mass: float, friction: float, table_friction: float) -> float:
-    """Return the pressing force [N] that drags an object of a `mass` [kg] (Coulomb's law).
-
-    A force N moves it if the fingers' friction N is at least the table's friction times N plus the
-    weight.
+def _brought(object_: ShapedObject, displacement: Float[Tensor, "3"]) -> Obstacles | None:
+    """Return the obstacles as the object finds them after a `displacement` [m]: they have come the
+    other way.
     """
-    weight = mass * GRAVITY
-    least = table_friction * weight / (friction - table_friction)
-    return min(max(DRAG.reserve * least, DRAG.weights * weight), DRAG.most)
-
-
-def _centre(object_: ShapedObject) -> Float[Tensor, "3"]:
-    """Return the centroid [m] of the volume within the estimated surface, in the upright frame.
-
-    Each triangle and the mean vertex span a tetrahedron. The centroid is the mean of theirs, with
-    their signed volumes as weights.
-    """
-    vertices = object_.surface.vertices.cpu().double()
-    middle = vertices.mean(0)
-    corners = (vertices - middle)[object_.surface.faces.cpu()]  # (f, 3, 3)
-    volumes = torch.linalg.det(corners)
-    return middle + (volumes[:, None] * corners.sum(1)).sum(0) / (4 * volumes.sum())
-
-
-def _find_drag(
-    object_: ShapedObject,
-    hand: Hand,
-    table: Plane,
-    centre: Float[Tensor, "3"],
-    length: float,
-    force: float,
-    lever: float,
-) -> DragPlan | None:
-    """Return the drag of a `length` [m] with the best posture that presses on the object; None if
-    there is none.
-
-    `centre` [m] is the centre of mass in the upright frame. Two tips must be at least `lever` times
-    as far apart as it is off the line along which they drag.
-    """
-    assert table.edge is not None
-    hand = hand.to("cpu", torch.float64)
-    frame = object_.obj_from_upright
-    outward = table.edge.normal.double()
-    postures = press_postures(hand)
-    upright_from_cloud = inverse(frame)[:3, :3]
-    towards = upright_from_cloud @ outward
-    # narrow objects roll unless they are dragged along
-    for angle in DRAG.aside:
-        turn = rotation_from_vector(math.radians(angle) * table.normal.double())
-        displacement = (length / math.cos(math.radians(angle))) * (turn @ outward)
-        way = upright_from_cloud @ displacement
-        if not _is_free(object_, way):
-            continue
-        found = _place(object_, hand, postures, centre, towards, way, force, lever)
-        if found is None:
-            continue
-        at, upright_from_press = found
-        obj_from_press = frame @ upright_from_press
-        presses = postures.presses[at]
-        feet = apply(obj_from_press, postures.feet[at])
-        return DragPlan(
-            joints=postures.joints[at],
-            obj_from_hand=obj_from_press @ postures.press_from_hand[at],
-            presses=presses,
-            feet=torch.where(presses[:, None], feet, torch.nan),
-            displacement=displacement,
-            force=force,
-            table=table,
-        )
-    return None
-
-
-def _place(
-    object_: ShapedObject,
-    hand: Hand,
-    postures: PressPostures,
-    centre: Float[Tensor, "3"],
-    edge: Float[Tensor, "3"],
-    way: Float[Tensor, "3"],
-    force: float,
-    lever: float,
-) -> tuple[int, Float[Tensor, "4 4"]] | None:
-    """Return the index of the best pressing posture, and its pose (4, 4) [m] on the object.
-
-    All is in the upright frame. The unit vector `edge` points to the edge, to which `way` [m]
-    leads. None if no posture fits.
-    """
-    outward = unit(way)
-    sideways = torch.linalg.cross(torch.eye(3, dtype=torch.float64, device="cpu")[2], outward)
-    top = _Top(object_, outward)
-    places = top.places(centre, edge)
-    share = postures.presses.sum(1).double()
-    able = flatnonzero(postures.strength >= force / share)
-    angles = torch.arange(DRAG.turns, device="cpu").double() * (2 * math.pi / DRAG.turns)
-    turns = _turns(angles)  # (t, 3, 3)
-    steady = _is_steady(postures, turns.mT @ outward)  # (p, t)
-    for tips in (2, 1):
-        rows = able[postures.presses[able].sum(1) == tips][: DRAG.postures]
-        presses = postures.presses[rows][:, None]
-        turned = (turns @ postures.feet[rows][:, None].mT).mT  # (p, t, f, 3)
-        apart = _apart(postures.feet[rows], postures.presses[rows])
-        for place in places:
-            off = abs(float((centre - place) @ sideways))
-            resists = off <= DRAG.pivot if tips == 1 else lever * off <= apart
-            feet = turned + place
-            ahead = ((feet - centre) @ edge).where(presses, -math.inf).amax(2)
-            height, flat = top.stand(feet)
-            low = height.where(presses, math.inf).amin(2)
-            high = height.where(presses, -math.inf).amax(2)
-            good = steady[rows] & (flat | ~presses).all(2) & (high - low <= DRAG.flat)
-            good &= ahead <= DRAG.behind - DRAG.supported
-            good &= torch.as_tensor(resists, device="cpu").expand(len(rows))[:, None]
-            for p, t in torch.nonzero(good).tolist():
-                at = int(rows[p])
-                pose = rigid(turns[t], torch.stack([place[0], place[1], high[p, t]]))
-                if _is_clear(object_, hand, postures, at, pose, way):
-                    return at, pose
-    return None
-
-
-def _apart(feet: Float[Tensor, "p f 3"], presses: Bool[Tensor, "p f"]) -> Float[Tensor, "p"]:
-    """Return the distance [m] of the two pressing tips of each posture; 0 for one tip."""
-    both = presses[:, :, None] & presses[:, None, :]
-    return (torch.cdist(feet, feet) * both).flatten(1).amax(1)
-
-
-def _is_steady(postures: PressPostures, ways: Float[Tensor, "t 3"]) -> Bool[Tensor, "p t"]:
-    """Return whether each posture presses on steadily while it drags along each of `ways`.
-
-    Where a tip sticks, a motion of the palm along the unit vector w changes the tip's force by K w,
-    for its stiffness K. So each newton of the drag, w . K w, changes the pressing force by
-    -z . K w.
-    """
-    force = torch.einsum("pfij,tj->ptfi", postures.stiffness, ways)
-    along = (force * ways[:, None]).sum(-1)
-    change = -force[..., 2] / along
-    steady = (change >= -DRAG.unloading) & (change <= DRAG.digging)
-    return (steady | ~postures.presses[:, None]).all(2)
-
-
-def _turns(angles: Float[Tensor, "t"]) -> Float[Tensor, "t 3 3"]:
-    """Return the rotations about the vertical by `angles` [rad]."""
-    cosine, sine = torch.cos(angles), torch.sin(angles)
-    zero, one = torch.zeros_like(angles), torch.ones_like(angles)
-    rows = [cosine, -sine, zero, sine, cosine, zero, zero, zero, one]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
-
-
-class _Top:
-    """A map of an object's top, seen from above, on a grid with the spacing `DRAG.cell` [m].
-
-    Attributes:
-        height: height (n, m) [m] of the top at each node.
-        stands: whether a tip can press at each node (n, m): the top is flat around it.
-    """
-
-    def __init__(self, object_: ShapedObject, outward: Float[Tensor, "3"]) -> None:
-        from scipy.spatial import KDTree
-
-        points = _facing_up(object_)
-        margin = DRAG.rim + DRAG.support + DRAG.cell
-        self.low = points[:, :2].amin(0) - margin
-        n, m = ((points[:, :2].amax(0) + margin - self.low) / DRAG.cell).ceil().long().tolist()
-        steps = torch.cartesian_prod(torch.arange(n + 1), torch.arange(m + 1)).double()
-        nodes = self.low + DRAG.cell * steps
-        gap, index = KDTree(points[:, :2].numpy()).query(nodes.numpy())
-        self.height = points[torch.from_numpy(index), 2].view(n + 1, m + 1)
-        self.seen = (torch.from_numpy(gap) <= DRAG.near).view(n + 1, m + 1)
-        angles = torch.arange(DRAG.ring).double() * (2 * math.pi / DRAG.ring)
-        ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
-        # before and behind the tip the top must reach farther
-        along = DRAG.support * torch.stack([outward[:2], -outward[:2]])
-        around = torch.cat([ring.new_zeros(1, 2), ring, along])
-        height, seen = self._look(self.height, self.seen, nodes[:, None] + around)
-        low, high = height.aminmax(dim=1)
-        flat = seen.all(1) & (high - low <= DRAG.flat)
-        self.stands = flat.view(n + 1, m + 1)
-        self.nodes = nodes[flat]
-
-    def _look(
-        self, height: Float[Tensor, "n m"], good: Bool[Tensor, "n m"], places: Float[Tensor, "*b 2"]
-    ) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
-        """Return both maps at the nodes nearest to `places` [m]; beyond the maps nothing is good."""
-        index = ((places - self.low) / DRAG.cell).round().long()
-        size = torch.tensor(height.shape)
-        inside = ((index >= 0) & (index < size)).all(-1)
-        row, column = torch.where(inside[..., None], index, 0).unbind(-1)
-        return height[row, column], good[row, column] & inside
-
-    def stand(self, feet: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
-        """Return the height [m] of the top below each of `feet` [m], and whether a tip can press."""
-        return self._look(self.height, self.stands, feet[..., :2])
-
-    def places(self, centre: Float[Tensor, "3"], edge: Float[Tensor, "3"]) -> Float[Tensor, "k 3"]:
-        """Return places [m] on the top, far enough from the edge, those nearest to the `centre`
-        first.
-
-        `edge` is the unit vector towards the edge.
-        """
-        cells = torch.round((self.nodes - centre[:2]) / DRAG.spacing)
-        _, cell = torch.unique(cells, dim=0, return_inverse=True)
-        count = torch.bincount(cell)
-        places = torch.zeros(len(count), 3, dtype=torch.float64)
-        # the mean of the nodes in each cell: on a narrow object it lies on its ridge
-        places[:, :2].index_add_(0, cell, self.nodes)
-        places = places / count[:, None]
-        places = places[(places - centre) @ edge <= DRAG.behind - DRAG.supported]
-        distance = norm((places - centre)[:, :2])
-        return places[torch.argsort(distance, stable=True)][: DRAG.places]
-
-
-def _facing_up(object_: ShapedObject) -> Float[Tensor, "k 3"]:
-    """Return the centres [m] of the triangles of an object's surface that face up."""
-    vertices = object_.surface.vertices.cpu().double()
-    corners = vertices[object_.surface.faces.cpu()]  # (f, 3, 3)
-    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size = norm(normals).clamp_min(torch.finfo(normals.dtype).tiny)
-    return corners[normals[:, 2] > DRAG.upward * size].mean(1)
-
-
-def _is_free(object_: ShapedObject, way: Float[Tensor, "3"]) -> bool:
-    """Return whether no neighbour is in the object's way along the table."""
     if object_.obstacles is None:
-        return True
-    vertices = object_.surface.vertices.cpu().double()
-    path = vertices + _shares()[:, None, None] * way
+        return None
     field = object_.obstacles.field
-    before = field.query(vertices.to(field.nodes))[0].min()
-    nearest = field.query(path.flatten(0, 1).to(field.nodes))[0].min()
-    # noise of the grid may let the object touch an obstacle where it stands
-    return bool(nearest >= torch.clamp(before, max=0.0))
-
-
-def _shares() -> Float[Tensor, "k"]:
-    """Return the shares of the way at which collisions are checked."""
-    return torch.linspace(0, 1, DRAG.steps, dtype=torch.float64, device="cpu")
-
-
-def _is_clear(
-    object_: ShapedObject,
-    hand: Hand,
-    postures: PressPostures,
-    at: int,
-    pose: Float[Tensor, "4 4"],
-    way: Float[Tensor, "3"],
-) -> bool:
-    """Return whether a hand presses with its pressing tips alone, and keeps clear of all else.
-
-    The hand is in the posture with index `at` at a `pose` [m]. It comes down from above, and moves
-    with the object along the `way` [m], clear of the table and of the object's neighbours.
-    """
-    spheres = hand.collision_spheres
-    pressing = flatnonzero(postures.presses[at])
-    tips = spheres.touching & torch.isin(spheres.finger, pressing)
-    centres = apply(pose, postures.spheres[at])[~tips]
-    radius = spheres.radius.to(centres)[~tips]
-    if float((centres[:, 2] - radius).min()) < DRAG.clear:
-        return False
-    heights = torch.linspace(0, DRAG.approach, DRAG.lowered, dtype=torch.float64, device="cpu")
-    up = torch.eye(3, dtype=torch.float64, device="cpu")[2]
-    down = centres + heights[:, None, None] * up
-    if _gap(object_.body.field, down, radius) < DRAG.clear:
-        return False
-    if object_.obstacles is None:
-        return True
-    path = torch.cat([down, centres + _shares()[:, None, None] * way])
-    return _gap(object_.obstacles.field, path, radius) >= DRAG.clear
-
-
-def _gap(field: DistanceField, path: Float[Tensor, "k s 3"], radius: Float[Tensor, "s"]) -> float:
-    """Return the least clearance [m] of spheres on a path from a field's surface."""
-    distance = field.query(path.to(field.nodes))[0].cpu()
-    return float((distance - radius.to(distance)).min())
+    way = inverse(object_.obj_from_upright)[:3, :3] @ displacement
+    field = dataclasses.replace(field, origin=field.origin - way.to(field.origin))
+    return dataclasses.replace(object_.obstacles, field=field)
