@@ -30,7 +30,7 @@ from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.run import plan_shaped
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.success.task import GraspTask
+from torchgrasp.success.task import GraspTask, TaskWrenches
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ContactSpec
@@ -78,6 +78,8 @@ class DragNumbers:
     """Greatest gain of pressing force for each newton of the drag: then the tips would jam."""
     reserve: float = 3.0
     """Ratio of the pressing force to the least one that moves the object."""
+    carried: float = 1.5
+    """Ratio of the load that grasps must resist to the weight: its lever is known to a third."""
     most: float = 20.0
     """Greatest pressing force [N]: thin things bend, and hands are weak."""
     shortest: float = 0.002
@@ -177,13 +179,14 @@ def plan_edge_grasps(
         raise BadArgument("table_friction", found, "less than the friction of the fingertips")
     hand = as_hand(hand, "hand")
     request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
+    mass = Distribution.of(request.grasp_task.mass).most
+    request = dataclasses.replace(request, resist=_weight(mass, table))
     object_ = ShapedObject.of(request)
     shape = object_.shape.moved(object_.obj_from_upright)
     length = _length(object_, table)
     if length <= DRAG.shortest:
         reason = "the object hangs over the edge as far as it can"
         return EdgePlan(None, plan_shaped(object_, request), shape, reason)
-    mass = Distribution.of(request.grasp_task.mass).most
     force = _force(mass, spec.mean_friction, table_friction)
     drag = _find_drag(object_, hand, table, length, force)
     if drag is None:
@@ -205,6 +208,15 @@ def _length(object_: ShapedObject, table: Plane) -> float:
     assert table.edge is not None
     centre = apply(object_.obj_from_upright, object_.body.center.cpu().double()[None])[0]
     return -float(table.edge.height(centre)) - DRAG.behind
+
+
+def _weight(mass: float, table: Plane) -> TaskWrenches:
+    """Return the load that grasps must resist: the weight of a `mass` [kg], with a reserve.
+
+    The hand grasps the object beside its centre of mass, so that its weight would turn it.
+    """
+    force = -DRAG.carried * mass * GRAVITY * table.normal.double()
+    return TaskWrenches(torch.cat([force, torch.zeros_like(force)])[None])
 
 
 def _force(mass: float, friction: float, table_friction: float) -> float:

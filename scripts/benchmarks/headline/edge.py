@@ -36,6 +36,8 @@ from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.specs import Simulator, TrialSpec
 
+FIRST = 40_000
+"""Number of the first body: nobody has seen these bodies when constants were chosen."""
 GAP = 0.1
 """Distance [m] of the body from each edge of the corner."""
 RAISED = 0.5
@@ -48,9 +50,9 @@ LIMIT = 600.0
 def edge(o: Options) -> list[Row]:
     """Lift authored bodies that are 8 to 16 mm high, 0.1 m from a corner of their table."""
     count = o.times(LOW_BODIES)
-    folder = o.out / f"low_{count}"
+    folder = o.out / f"edge_{count}"
     if not (folder / "manifest.json").is_file():
-        household(folder, count, highest=HIGHEST)
+        household(folder, count, FIRST, HIGHEST)
     return [_tried(o, folder, hand, bar) for hand, bar in LOW.items()]
 
 
