@@ -77,6 +77,11 @@ def test_a_drag_that_no_planner_wrote_is_refused_by_its_field(name, value, words
         drag_of(dataclasses.replace(grasps, meta=meta))
 
 
+def test_a_drag_of_another_hand_is_refused():
+    with pytest.raises(BadArgument, match="drag: .*4 and 3.*12 joints"):
+        with_drag(load_shipped_grasp("jug", "barrett"), drag())
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", "3", '{"force_n": NaN}'])
 def test_a_text_that_is_no_drag_is_refused(text):
     grasps = load_shipped_grasp("jug", "allegro")
