@@ -20,7 +20,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, Count, Pose, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
-from torchgrasp.geometry.frames import apply, inverse, rigid
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.geometry.signed_distance import DistanceField
@@ -42,12 +42,14 @@ GRAVITY = 9.81  # acceleration [m/s^2]
 class DragNumbers:
     """Parameters of a drag to the edge."""
 
-    behind: float = 0.012
+    behind: float = 0.015
     """Distance [m] behind the edge at which the centre of mass ends: its estimate is 5 mm off."""
     supported: float = 0.004
     """Least distance [m] behind the edge of each pressing tip at the end of the drag."""
     spacing: float = 0.008
     """Distance [m] of the places on the object's top where the hand may press."""
+    cell: float = 0.001
+    """Spacing [m] of the map of the object's top."""
     places: int = 60
     """Number of these places that are tried, those nearest to the centre of mass."""
     postures: int = 40
@@ -66,6 +68,8 @@ class DragNumbers:
     """Largest horizontal distance [m] of a point on the top from a vertex of it."""
     clear: float = 0.003
     """Least clearance [m] of all other links from the object and the table."""
+    aside: tuple[float, ...] = (0.0, 30.0, -30.0, 60.0, -60.0)
+    """Angles [deg] between the drag and the shortest way to the edge, in the order of trial."""
     lowered: int = 6
     """Number of heights at which the hand is checked on its way down."""
     approach: float = 0.05
@@ -78,6 +82,14 @@ class DragNumbers:
     """Greatest gain of pressing force for each newton of the drag: then the tips would jam."""
     reserve: float = 3.0
     """Ratio of the pressing force to the least one that moves the object."""
+    weights: float = 2.0
+    """Least ratio of the pressing force to the weight: the tips then resist a turn."""
+    pivot: float = 0.004
+    """Largest distance [m] of the centre of mass from the line along which one tip drags."""
+    share: float = 0.25
+    """Share of the friction of two tips that is left to resist a turn."""
+    support: float = 0.005
+    """Distance [m] before and behind a pressing tip to which the top must reach: else it rolls."""
     carried: float = 1.5
     """Ratio of the load that grasps must resist to the weight: its lever is known to a third."""
     most: float = 20.0
@@ -180,15 +192,19 @@ def plan_edge_grasps(
     hand = as_hand(hand, "hand")
     request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
     mass = Distribution.of(request.grasp_task.mass).most
-    request = dataclasses.replace(request, resist=_weight(mass, table))
     object_ = ShapedObject.of(request)
     shape = object_.shape.moved(object_.obj_from_upright)
-    length = _length(object_, table)
+    centre = _centre(object_)
+    length = _length(object_, centre, table)
+    load = _weight(mass, table, apply(object_.obj_from_upright, centre[None])[0])
+    request = dataclasses.replace(request, resist=load)
     if length <= DRAG.shortest:
         reason = "the object hangs over the edge as far as it can"
         return EdgePlan(None, plan_shaped(object_, request), shape, reason)
     force = _force(mass, spec.mean_friction, table_friction)
-    drag = _find_drag(object_, hand, table, length, force)
+    # the torque of the weight's friction, over the friction that is left to two tips
+    lever = 2 * table_friction * mass * GRAVITY / (DRAG.share * spec.mean_friction * force)
+    drag = _find_drag(object_, hand, table, centre, length, force, lever)
     if drag is None:
         reason = "no posture presses on the object from above, or a neighbour is in its way"
         return EdgePlan(None, plan_shaped(object_, request), shape, reason)
@@ -201,22 +217,23 @@ def plan_edge_grasps(
     return EdgePlan(drag, grasps, shape.moved(shift))
 
 
-def _length(object_: ShapedObject, table: Plane) -> float:
+def _length(object_: ShapedObject, centre: Float[Tensor, "3"], table: Plane) -> float:
     """Return how far [m] the object must be dragged, so that its centre of mass is `DRAG.behind` behind
     the edge.
     """
     assert table.edge is not None
-    centre = apply(object_.obj_from_upright, object_.body.center.cpu().double()[None])[0]
-    return -float(table.edge.height(centre)) - DRAG.behind
+    in_cloud = apply(object_.obj_from_upright, centre[None])[0]
+    return -float(table.edge.height(in_cloud)) - DRAG.behind
 
 
-def _weight(mass: float, table: Plane) -> TaskWrenches:
-    """Return the load that grasps must resist: the weight of a `mass` [kg], with a reserve.
+def _weight(mass: float, table: Plane, centre: Float[Tensor, "3"]) -> TaskWrenches:
+    """Return the load that grasps must resist: the weight of a `mass` [kg], with a reserve, at the
+    `centre` [m].
 
     The hand grasps the object beside its centre of mass, so that its weight would turn it.
     """
     force = -DRAG.carried * mass * GRAVITY * table.normal.double()
-    return TaskWrenches(torch.cat([force, torch.zeros_like(force)])[None])
+    return TaskWrenches(torch.cat([force, torch.zeros_like(force)])[None], centre)
 
 
 def _force(mass: float, friction: float, table_friction: float) -> float:
@@ -227,56 +244,89 @@ def _force(mass: float, friction: float, table_friction: float) -> float:
     """
     weight = mass * GRAVITY
     least = table_friction * weight / (friction - table_friction)
-    return min(max(DRAG.reserve * least, weight), DRAG.most)
+    return min(max(DRAG.reserve * least, DRAG.weights * weight), DRAG.most)
+
+
+def _centre(object_: ShapedObject) -> Float[Tensor, "3"]:
+    """Return the centroid [m] of the volume within the estimated surface, in the upright frame.
+
+    Each triangle and the mean vertex span a tetrahedron. The centroid is the mean of theirs, with
+    their signed volumes as weights.
+    """
+    vertices = object_.surface.vertices.cpu().double()
+    middle = vertices.mean(0)
+    corners = (vertices - middle)[object_.surface.faces.cpu()]  # (f, 3, 3)
+    volumes = torch.linalg.det(corners)
+    return middle + (volumes[:, None] * corners.sum(1)).sum(0) / (4 * volumes.sum())
 
 
 def _find_drag(
-    object_: ShapedObject, hand: Hand, table: Plane, length: float, force: float
+    object_: ShapedObject,
+    hand: Hand,
+    table: Plane,
+    centre: Float[Tensor, "3"],
+    length: float,
+    force: float,
+    lever: float,
 ) -> DragPlan | None:
     """Return the drag of a `length` [m] with the best posture that presses on the object; None if
     there is none.
+
+    `centre` [m] is the centre of mass in the upright frame. Two tips must be at least `lever` times
+    as far apart as it is off the line along which they drag.
     """
     assert table.edge is not None
     hand = hand.to("cpu", torch.float64)
     frame = object_.obj_from_upright
     outward = table.edge.normal.double()
     postures = press_postures(hand)
-    way = length * (inverse(frame)[:3, :3] @ outward)
-    if not _is_free(object_, way):
-        return None
-    found = _place(object_, hand, postures, way, force)
-    if found is None:
-        return None
-    at, upright_from_press = found
-    obj_from_press = frame @ upright_from_press
-    presses = postures.presses[at]
-    feet = apply(obj_from_press, postures.feet[at])
-    return DragPlan(
-        joints=postures.joints[at],
-        obj_from_hand=obj_from_press @ postures.press_from_hand[at],
-        presses=presses,
-        feet=torch.where(presses[:, None], feet, torch.nan),
-        displacement=length * outward,
-        force=force,
-        table=table,
-    )
+    upright_from_cloud = inverse(frame)[:3, :3]
+    towards = upright_from_cloud @ outward
+    # narrow objects roll unless they are dragged along
+    for angle in DRAG.aside:
+        turn = rotation_from_vector(math.radians(angle) * table.normal.double())
+        displacement = (length / math.cos(math.radians(angle))) * (turn @ outward)
+        way = upright_from_cloud @ displacement
+        if not _is_free(object_, way):
+            continue
+        found = _place(object_, hand, postures, centre, towards, way, force, lever)
+        if found is None:
+            continue
+        at, upright_from_press = found
+        obj_from_press = frame @ upright_from_press
+        presses = postures.presses[at]
+        feet = apply(obj_from_press, postures.feet[at])
+        return DragPlan(
+            joints=postures.joints[at],
+            obj_from_hand=obj_from_press @ postures.press_from_hand[at],
+            presses=presses,
+            feet=torch.where(presses[:, None], feet, torch.nan),
+            displacement=displacement,
+            force=force,
+            table=table,
+        )
+    return None
 
 
 def _place(
     object_: ShapedObject,
     hand: Hand,
     postures: PressPostures,
+    centre: Float[Tensor, "3"],
+    edge: Float[Tensor, "3"],
     way: Float[Tensor, "3"],
     force: float,
+    lever: float,
 ) -> tuple[int, Float[Tensor, "4 4"]] | None:
     """Return the index of the best pressing posture, and its pose (4, 4) [m] on the object.
 
-    All is in the upright frame, and `way` [m] leads to the edge. None if no posture fits.
+    All is in the upright frame. The unit vector `edge` points to the edge, to which `way` [m]
+    leads. None if no posture fits.
     """
     outward = unit(way)
-    top = _top(object_)
-    centre = object_.body.center.cpu().double()
-    places = top.places(centre, outward)
+    sideways = torch.linalg.cross(torch.eye(3, dtype=torch.float64, device="cpu")[2], outward)
+    top = _Top(object_, outward)
+    places = top.places(centre, edge)
     share = postures.presses.sum(1).double()
     able = flatnonzero(postures.strength >= force / share)
     angles = torch.arange(DRAG.turns, device="cpu").double() * (2 * math.pi / DRAG.turns)
@@ -286,20 +336,30 @@ def _place(
         rows = able[postures.presses[able].sum(1) == tips][: DRAG.postures]
         presses = postures.presses[rows][:, None]
         turned = (turns @ postures.feet[rows][:, None].mT).mT  # (p, t, f, 3)
+        apart = _apart(postures.feet[rows], postures.presses[rows])
         for place in places:
+            off = abs(float((centre - place) @ sideways))
+            resists = off <= DRAG.pivot if tips == 1 else lever * off <= apart
             feet = turned + place
-            ahead = ((feet - centre) @ outward).where(presses, -math.inf).amax(2)
+            ahead = ((feet - centre) @ edge).where(presses, -math.inf).amax(2)
             height, flat = top.stand(feet)
             low = height.where(presses, math.inf).amin(2)
             high = height.where(presses, -math.inf).amax(2)
             good = steady[rows] & (flat | ~presses).all(2) & (high - low <= DRAG.flat)
             good &= ahead <= DRAG.behind - DRAG.supported
+            good &= torch.as_tensor(resists, device="cpu").expand(len(rows))[:, None]
             for p, t in torch.nonzero(good).tolist():
                 at = int(rows[p])
                 pose = rigid(turns[t], torch.stack([place[0], place[1], high[p, t]]))
                 if _is_clear(object_, hand, postures, at, pose, way):
                     return at, pose
     return None
+
+
+def _apart(feet: Float[Tensor, "p f 3"], presses: Bool[Tensor, "p f"]) -> Float[Tensor, "p"]:
+    """Return the distance [m] of the two pressing tips of each posture; 0 for one tip."""
+    both = presses[:, :, None] & presses[:, None, :]
+    return (torch.cdist(feet, feet) * both).flatten(1).amax(1)
 
 
 def _is_steady(postures: PressPostures, ways: Float[Tensor, "t 3"]) -> Bool[Tensor, "p t"]:
@@ -325,53 +385,75 @@ def _turns(angles: Float[Tensor, "t"]) -> Float[Tensor, "t 3 3"]:
 
 
 class _Top:
-    """The top of an object: the vertices [m] of its surface whose normals point up."""
+    """A map of an object's top, seen from above, on a grid with the spacing `DRAG.cell` [m].
 
-    def __init__(self, vertices: Float[Tensor, "v 3"]) -> None:
+    Attributes:
+        height: height (n, m) [m] of the top at each node.
+        stands: whether a tip can press at each node (n, m): the top is flat around it.
+    """
+
+    def __init__(self, object_: ShapedObject, outward: Float[Tensor, "3"]) -> None:
         from scipy.spatial import KDTree
 
-        self.points = vertices
-        self.height = vertices[:, 2]
-        self.tree = KDTree(vertices[:, :2].numpy())
-        angles = torch.arange(DRAG.ring, device="cpu").double() * (2 * math.pi / DRAG.ring)
+        points = _facing_up(object_)
+        margin = DRAG.rim + DRAG.support + DRAG.cell
+        self.low = points[:, :2].amin(0) - margin
+        n, m = ((points[:, :2].amax(0) + margin - self.low) / DRAG.cell).ceil().long().tolist()
+        steps = torch.cartesian_prod(torch.arange(n + 1), torch.arange(m + 1)).double()
+        nodes = self.low + DRAG.cell * steps
+        gap, index = KDTree(points[:, :2].numpy()).query(nodes.numpy())
+        self.height = points[torch.from_numpy(index), 2].view(n + 1, m + 1)
+        self.seen = (torch.from_numpy(gap) <= DRAG.near).view(n + 1, m + 1)
+        angles = torch.arange(DRAG.ring).double() * (2 * math.pi / DRAG.ring)
         ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
-        self.around = torch.cat([ring.new_zeros(1, 2), ring])  # (k, 2)
+        # before and behind the tip the top must reach farther
+        along = DRAG.support * torch.stack([outward[:2], -outward[:2]])
+        around = torch.cat([ring.new_zeros(1, 2), ring, along])
+        height, seen = self._look(self.height, self.seen, nodes[:, None] + around)
+        low, high = height.aminmax(dim=1)
+        flat = seen.all(1) & (high - low <= DRAG.flat)
+        self.stands = flat.view(n + 1, m + 1)
+        self.nodes = nodes[flat]
 
-    def places(
-        self, centre: Float[Tensor, "3"], outward: Float[Tensor, "3"]
-    ) -> Float[Tensor, "k 3"]:
+    def _look(
+        self, height: Float[Tensor, "n m"], good: Bool[Tensor, "n m"], places: Float[Tensor, "*b 2"]
+    ) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
+        """Return both maps at the nodes nearest to `places` [m]; beyond the maps nothing is good."""
+        index = ((places - self.low) / DRAG.cell).round().long()
+        size = torch.tensor(height.shape)
+        inside = ((index >= 0) & (index < size)).all(-1)
+        row, column = torch.where(inside[..., None], index, 0).unbind(-1)
+        return height[row, column], good[row, column] & inside
+
+    def stand(self, feet: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
+        """Return the height [m] of the top below each of `feet` [m], and whether a tip can press."""
+        return self._look(self.height, self.stands, feet[..., :2])
+
+    def places(self, centre: Float[Tensor, "3"], edge: Float[Tensor, "3"]) -> Float[Tensor, "k 3"]:
         """Return places [m] on the top, far enough from the edge, those nearest to the `centre`
         first.
+
+        `edge` is the unit vector towards the edge.
         """
-        cells = torch.round((self.points - centre)[:, :2] / DRAG.spacing)
-        cells = torch.unique(cells, dim=0)
-        places = torch.cat([centre[:2] + DRAG.spacing * cells, torch.zeros_like(cells[:, :1])], 1)
-        offset = places - centre
-        places = places[offset @ outward <= DRAG.behind - DRAG.supported]
+        cells = torch.round((self.nodes - centre[:2]) / DRAG.spacing)
+        _, cell = torch.unique(cells, dim=0, return_inverse=True)
+        count = torch.bincount(cell)
+        places = torch.zeros(len(count), 3, dtype=torch.float64)
+        # the mean of the nodes in each cell: on a narrow object it lies on its ridge
+        places[:, :2].index_add_(0, cell, self.nodes)
+        places = places / count[:, None]
+        places = places[(places - centre) @ edge <= DRAG.behind - DRAG.supported]
         distance = norm((places - centre)[:, :2])
         return places[torch.argsort(distance, stable=True)][: DRAG.places]
 
-    def stand(self, feet: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
-        """Return the height [m] of the top below each of `feet` [m], and whether it is flat there,
-        and away from the outline.
-        """
-        places = feet[..., None, :2] + self.around
-        gap, index = self.tree.query(places.reshape(-1, 2).numpy())
-        height = self.height[torch.from_numpy(index)].reshape(places.shape[:-1])
-        near = torch.from_numpy(gap).reshape(places.shape[:-1]) <= DRAG.near
-        low, high = height.aminmax(dim=-1)
-        return height[..., 0], near.all(-1) & (high - low <= DRAG.flat)
 
-
-def _top(object_: ShapedObject) -> _Top:
-    """Return the top of an object, in its upright frame."""
-    mesh = object_.surface
-    vertices = mesh.vertices.cpu().double()
-    corners = vertices[mesh.faces.cpu()]  # (f, 3, 3)
+def _facing_up(object_: ShapedObject) -> Float[Tensor, "k 3"]:
+    """Return the centres [m] of the triangles of an object's surface that face up."""
+    vertices = object_.surface.vertices.cpu().double()
+    corners = vertices[object_.surface.faces.cpu()]  # (f, 3, 3)
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size = torch.linalg.vector_norm(normals, dim=-1).clamp_min(torch.finfo(normals.dtype).tiny)
-    upward = normals[:, 2] > DRAG.upward * size
-    return _Top(corners[upward].mean(1))
+    size = norm(normals).clamp_min(torch.finfo(normals.dtype).tiny)
+    return corners[normals[:, 2] > DRAG.upward * size].mean(1)
 
 
 def _is_free(object_: ShapedObject, way: Float[Tensor, "3"]) -> bool:
