@@ -141,7 +141,7 @@ def draw_certificates(path: Path) -> None:
 SLAB = "#b4c0cc"
 """Colour of the table in the picture of a drag."""
 
-SHOT = (640, 440)
+SHOT = (960, 660)
 """Width and height [pixels] of a picture of a drag."""
 FRONT = np.array([0.0, -0.055, 0.0])
 """Place [m] of the arrow of the drag: in front of the box."""
@@ -174,19 +174,30 @@ def draw_drag(path: Path) -> None:
         Panel("3. pinch what hangs over", grasp.joints[0], grasp.obj_from_hand[0], way),
     )
     slab = trimesh.creation.box([0.27, 0.16, 0.02]).apply_translation([0.015, 0.0, -0.01])
-    corners = np.array([[-0.14, -0.08, -0.07], [0.25, 0.08, 0.13]])
+    hands = [
+        solids_from_hand(hand, hand.expand_joints(x.joints), hand.tree.joint_names, x.pose)
+        for x in panels
+    ]
+    corners = np.concatenate([slab.vertices, *(s.vertices for solids in hands for s in solids)])
     camera = frame_camera(corners, (0.3, -1.0, 0.1), size=SHOT)
     begin, end = project(np.stack([0 * way, way]) + FRONT, camera)
-    figure, all_axes = plt.subplots(1, 3, figsize=(10.0, 2.5), dpi=110, layout="constrained")
-    for axes, panel in zip(all_axes, panels, strict=True):
+    shots = []
+    for panel, solids in zip(panels, hands, strict=True):
         canvas = Canvas()
         canvas.add_mesh(slab.vertices, slab.faces, SLAB)
         canvas.add_mesh(box.vertices + panel.moved, box.faces, OBJECT)
         if panel.moved.any():
             canvas.add_mesh(box.vertices, box.faces, OBJECT, transparent=True)
-        joints = hand.expand_joints(panel.joints.double())
-        add_solids(canvas, solids_from_hand(hand, joints, hand.tree.joint_names, panel.pose))
-        axes.imshow(canvas.render(camera, SHOT))
+        add_solids(canvas, solids)
+        shots.append(canvas.render(camera, SHOT))
+    # all three are cut to what any of them shows
+    drawn = np.any(np.stack(shots) != shots[0][0, 0], axis=(0, 3))
+    left, *_, right = np.flatnonzero(drawn.any(0))
+    top, *_, bottom = np.flatnonzero(drawn.any(1))
+    figure, all_axes = plt.subplots(1, 3, figsize=(10.0, 2.0), dpi=110, layout="constrained")
+    for axes, panel, shot in zip(all_axes, panels, shots, strict=True):
+        axes.imshow(shot)
+        axes.set(xlim=(left, right), ylim=(bottom, top))
         if panel.title.startswith("2"):
             axes.annotate("", end, begin, arrowprops={"arrowstyle": "-|>", "linewidth": 1.6})
         axes.set_title(panel.title, fontsize=11, color=INK)

@@ -78,7 +78,7 @@ def test_a_drag_that_no_planner_wrote_is_refused_by_its_field(name, value, words
 
 
 def test_a_drag_of_another_hand_is_refused():
-    with pytest.raises(BadArgument, match="drag: .*4 and 3.*12 joints"):
+    with pytest.raises(BadArgument, match=r"drag: .*4 and 3.*12 joints"):
         with_drag(load_shipped_grasp("jug", "barrett"), drag())
 
 
