@@ -15,7 +15,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import is_rigid
 from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.planner.edge import DRAG, DragPlan
+from torchgrasp.planner.drag_plan import DRAG, DragPlan
 from torchgrasp.values.planning import Grasps
 
 KEY = "drag"
@@ -34,7 +34,7 @@ def with_drag(grasps: Grasps, drag: DragPlan) -> Grasps:
     >>> x = torch.tensor([1.0, 0, 0])
     >>> spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.2 * x, x))
     >>> plan = plan_edge_grasps(load_object("cylinder"), "barrett", spec, starts=8)
-    >>> plan.drag is None or drag_of(with_drag(plan.grasps, plan.drag)) == plan.drag
+    >>> plan.drag is None or drag_of(plan.grasps) == plan.drag
     True
     """
     joints, fingers = _names(grasps)

@@ -30,6 +30,7 @@ from torchgrasp.planner.drag_plan import (
     find_drag,
     length_to_edge,
 )
+from torchgrasp.planner.drag_text import with_drag
 from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.run import plan_shaped
@@ -48,7 +49,8 @@ class EdgePlan(Value):
     Attributes:
         drag: the drag; None if there is none, for which `reason` tells why.
         grasps: grasps of the object after the drag, or of the object where it stands without one.
-            They are in the frame of the cloud, the best first, as those of `plan_grasps`.
+            They are in the frame of the cloud, the best first, as those of `plan_grasps`. Their
+            metadata hold the drag (`torchgrasp.planner.drag_of`), so that one file has both.
         shape: the estimated shape after the drag, in the same frame.
         reason: why there is no drag: the object hangs over the edge far enough, or is too heavy, or
             no posture of the hand can press on it, or a neighbour is in its way. Or the edge is too
@@ -135,7 +137,7 @@ def plan_edge_grasps(
     grasps = plan_shaped(object_, request)
     grasps = move(grasps, shift)
     grasps = dataclasses.replace(grasps, meta={**grasps.meta, "table": table.describe()})
-    return EdgePlan(drag, grasps, shape.moved(shift))
+    return EdgePlan(drag, with_drag(grasps, drag), shape.moved(shift))
 
 
 def _weight(mass: float, table: Plane, centre: Float[Tensor, "3"]) -> TaskWrenches:

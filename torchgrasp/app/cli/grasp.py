@@ -45,8 +45,9 @@ from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surfac
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.clearing import order_to_clear
-from torchgrasp.planner.drag_text import KEY, with_drag
-from torchgrasp.planner.edge import DragPlan, EdgePlan, plan_edge_grasps
+from torchgrasp.planner.drag_plan import DragPlan
+from torchgrasp.planner.drag_text import KEY
+from torchgrasp.planner.edge import EdgePlan, plan_edge_grasps
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
@@ -281,7 +282,7 @@ class Grasp(ForPrograms):
                 edge = self._plan_drag(cloud, hand, spec, grasps, progress)
             drag = None if edge is None else edge.drag
             if edge is not None and drag is not None:
-                grasps, shape = with_drag(edge.grasps, drag), edge.shape
+                grasps, shape = edge.grasps, edge.shape
                 progress.values["plan"] = None  # the contacts where the object stood
                 cloud = move(cloud, rigid(torch.eye(3), drag.displacement).to(cloud.points))
             run = self._gather(name, path, cloud, hand, spec, grasps, shape, progress, explanation)
