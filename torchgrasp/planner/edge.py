@@ -65,9 +65,9 @@ class DragNumbers:
     flat: float = 0.003
     """Largest difference [m] of heights on this circle."""
     near: float = 0.0025
-    """Largest horizontal distance [m] of a point on the top from the middle of a triangle; in a
-    coarse mesh, that of the triangle's own corners.
-    """
+    """Largest horizontal distance [m] of a point on the top from the middle of a triangle."""
+    finest: int = 8
+    """Greatest number of parts into which edges of a coarse mesh are cut, so that middles are near."""
     clear: float = 0.003
     """Least clearance [m] of all other links from the object and the table."""
     lowered: int = 6
@@ -363,7 +363,7 @@ def _turns(angles: Float[Tensor, "t"]) -> Float[Tensor, "t 3 3"]:
 
 
 class _Top:
-    """The top of an object: the triangles of its surface whose normals point up.
+    """The top of an object: points all over the triangles of its surface whose normals point up.
 
     `corners` (v, 3, 3) [m] are those of these triangles.
     """
@@ -371,10 +371,10 @@ class _Top:
     def __init__(self, corners: Float[Tensor, "v 3 3"]) -> None:
         from scipy.spatial import KDTree
 
-        self.points = corners.mean(1)
+        longest = float(norm(corners - corners.roll(1, 1)).max()) if len(corners) else 0.0
+        parts = min(max(math.ceil(longest / DRAG.near), 1), DRAG.finest)
+        self.points = (_middles(parts) @ corners).flatten(0, 1)
         self.height = self.points[:, 2]
-        reach = norm((corners - self.points[:, None])[..., :2]).amax(1)
-        self.near = reach.clamp_min(DRAG.near)
         self.tree = KDTree(self.points[:, :2].numpy())
         angles = torch.arange(DRAG.ring, device="cpu").double() * (2 * math.pi / DRAG.ring)
         ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
@@ -400,11 +400,22 @@ class _Top:
         """
         places = feet[..., None, :2] + self.around
         gap, index = self.tree.query(places.reshape(-1, 2).numpy())
-        index = torch.from_numpy(index)
-        height = self.height[index].reshape(places.shape[:-1])
-        near = (torch.from_numpy(gap) <= self.near[index]).reshape(places.shape[:-1])
+        height = self.height[torch.from_numpy(index)].reshape(places.shape[:-1])
+        near = torch.from_numpy(gap).reshape(places.shape[:-1]) <= DRAG.near
         low, high = height.aminmax(dim=-1)
         return height[..., 0], near.all(-1) & (high - low <= DRAG.flat)
+
+
+def _middles(parts: int) -> Float[Tensor, "k 3"]:
+    """Return barycentric coordinates of the middles of the triangles into which three families of
+    parallel lines cut a triangle, whose edges they cut into `parts`.
+    """
+    steps = torch.arange(3 * parts, dtype=torch.float64, device="cpu")
+    grid = torch.cartesian_prod(steps, steps)
+    grid = torch.cat([grid, 3 * parts - grid.sum(1, keepdim=True)], 1)
+    # in thirds of a part, the three coordinates of a middle leave the same rest
+    same = (grid % 3 == grid[:, :1] % 3).all(1) & (grid[:, :1] % 3 != 0).all(1)
+    return grid[same & (grid > 0).all(1)] / (3 * parts)
 
 
 def _top(object_: ShapedObject) -> _Top:
