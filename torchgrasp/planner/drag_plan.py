@@ -8,12 +8,14 @@ import dataclasses
 import math
 from typing import Annotated
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import ANY, Pose
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import norm, unit
@@ -54,9 +56,7 @@ class DragNumbers:
     flat: float = 0.003
     """Largest difference [m] of heights on this circle."""
     near: float = 0.0025
-    """Largest horizontal distance [m] of a point on the top from the middle of a triangle; in a
-    coarse mesh, that of the triangle's own corners.
-    """
+    """Largest horizontal distance [m] of a place on the top from a point of it."""
     clear: float = 0.003
     """Least clearance [m] of all other links from the object and the table."""
     aside: tuple[float, ...] = (0.0, 30.0, -30.0, 60.0, -60.0)
@@ -258,7 +258,7 @@ class _Search:
         postures = self.postures
         outward = unit(self.way)
         sideways = torch.stack([-outward[1], outward[0], torch.zeros_like(outward[0])])
-        top = _Top(self.object_, outward)
+        top = _Top(_facing_up(self.object_), outward)
         places = top.places(self.centre, self.edge)
         share = postures.presses.sum(1).double()
         able = flatnonzero(postures.strength >= force / share)
@@ -349,15 +349,23 @@ def _turns(angles: Float[Tensor, "t"]) -> Float[Tensor, "t 3 3"]:
 class _Top:
     """A map of an object's top, seen from above, on a grid with the spacing `DRAG.cell` [m].
 
+    Args:
+        corners: those of the triangles (k, 3, 3) [m] of the surface that face up.
+        outward: unit vector along which the object is dragged.
+
     Attributes:
         height: height (n, m) [m] of the top at each node.
         stands: whether a tip can press at each node (n, m): the top is flat around it.
     """
 
-    def __init__(self, object_: ShapedObject, outward: Float[Tensor, "3"]) -> None:
+    def __init__(self, corners: Float[Tensor, "k 3 3"], outward: Float[Tensor, "3"]) -> None:
         from scipy.spatial import KDTree
 
-        points, near = _facing_up(object_)
+        # points all over the triangles
+        faces = np.arange(3 * len(corners)).reshape(-1, 3)
+        vertices = corners.flatten(0, 1).numpy()
+        dense = trimesh.remesh.subdivide_to_size(vertices, faces, max_edge=DRAG.near)[0]
+        points = torch.from_numpy(dense)
         margin = DRAG.rim + DRAG.support + DRAG.cell
         self.low = points[:, :2].amin(0) - margin
         n, m = ((points[:, :2].amax(0) + margin - self.low) / DRAG.cell).ceil().long().tolist()
@@ -368,7 +376,7 @@ class _Top:
         gap, index = KDTree(points[:, :2].numpy()).query(nodes.numpy())
         index = torch.from_numpy(index)
         self.height = points[index, 2].view(n + 1, m + 1)
-        seen = (torch.from_numpy(gap) <= near[index]).view(n + 1, m + 1)
+        seen = (torch.from_numpy(gap) <= DRAG.near).view(n + 1, m + 1)
         angles = torch.arange(DRAG.ring, device="cpu").double() * (2 * math.pi / DRAG.ring)
         ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
         # before and behind the tip the top must reach farther
@@ -412,19 +420,13 @@ class _Top:
         return places[torch.argsort(distance, stable=True)][: DRAG.places]
 
 
-def _facing_up(object_: ShapedObject) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k"]]:
-    """Return the centres [m] of the triangles of an object's surface that face up.
-
-    The second result is the horizontal distance [m] within which each triangle shows the top.
-    """
+def _facing_up(object_: ShapedObject) -> Float[Tensor, "k 3 3"]:
+    """Return the corners [m] of the triangles of an object's surface that face up."""
     vertices = object_.surface.vertices.cpu().double()
     corners = vertices[object_.surface.faces.cpu()]  # (f, 3, 3)
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = norm(normals).clamp_min(torch.finfo(normals.dtype).tiny)
-    corners = corners[normals[:, 2] > DRAG.upward * size]
-    centres = corners.mean(1)
-    reach = norm((corners - centres[:, None])[..., :2]).amax(1)
-    return centres, reach.clamp_min(DRAG.near)
+    return corners[normals[:, 2] > DRAG.upward * size]
 
 
 def _is_free(object_: ShapedObject, way: Float[Tensor, "3"]) -> bool:
