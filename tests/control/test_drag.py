@@ -66,11 +66,13 @@ class Springs:
     where they exceed Coulomb's law, anchors and block move until they do not.
 
     `top` is the height [m] of the block above the planned one, and `ends` the distance [m] from the
-    start behind which the block has no top along the drag.
+    start behind which the block has no top along the drag. `share` is that of the fingers' planned
+    stiffness.
     """
 
-    def __init__(self, name, top=0.0, ends=np.inf, noise=None):
-        self.hand, self.plan, self.stiffness = made(name)
+    def __init__(self, name, top=0.0, ends=np.inf, noise=None, share=1.0):
+        self.hand, self.plan, stiffness = made(name)
+        self.stiffness = share * stiffness
         self.top = top
         self.ends = ends
         self.generator = None if noise is None else torch.Generator().manual_seed(noise)
@@ -157,15 +159,15 @@ class Springs:
         return controller, forces
 
 
-@pytest.mark.parametrize("noise", [None, 0, 1])
+@pytest.mark.parametrize(("share", "noise"), [(1.0, None), (0.25, None), (0.25, 0)])
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
-def test_the_block_goes_as_far_as_planned_although_the_fingers_bend(name, noise):
-    world = Springs(name, noise=noise)
+def test_the_block_goes_as_far_as_planned_although_the_fingers_bend(name, share, noise):
+    world = Springs(name, noise=noise, share=share)
     controller, forces = world.run()
     assert controller.status is Status.OK
-    assert world.bent > 1e-3
+    assert world.bent > (1e-3 if share == 1.0 else 4e-3)
     planned = world.plan.displacement[:2].numpy()
-    assert np.linalg.norm(world.block - planned) < (2e-3 if noise is None else 3e-3)
+    assert np.linalg.norm(world.block - planned) < (1e-3 if noise is None else 1.5e-3)
     assert forces["down"][-1] > 0.8 * world.plan.force
     middle = forces["drag"][len(forces["drag"]) // 4 :]
     assert np.mean(middle) == pytest.approx(world.plan.force, rel=0.15)
@@ -177,7 +179,7 @@ def test_a_block_of_another_height_is_pressed_as_planned(top):
     world = Springs("allegro", top=top)
     controller, _ = world.run()
     assert controller.status is Status.OK
-    assert np.linalg.norm(world.block - world.plan.displacement[:2].numpy()) < 2e-3
+    assert np.linalg.norm(world.block - world.plan.displacement[:2].numpy()) < 1e-3
     assert world.most < 2 * world.plan.force
 
 
@@ -195,7 +197,6 @@ def test_a_hand_that_finds_nothing_rises_before_it_is_far_below_the_table(noise)
 def test_a_hand_that_loses_the_block_on_the_way_rises_at_once():
     # the tips slip off: the table holds the block, and its top ends
     world = Springs("barrett", ends=0.02)
-    world.stiffness = world.stiffness.copy()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tests.control.test_drag.TABLE_FRICTION", 5.0)
         controller, forces = world.run()
@@ -206,8 +207,7 @@ def test_a_hand_that_loses_the_block_on_the_way_rises_at_once():
 
 
 def test_a_hand_too_soft_to_press_gives_up():
-    world = Springs("allegro")
-    world.stiffness = 1e-2 * world.stiffness
+    world = Springs("allegro", share=0.01)
     controller, forces = world.run()
     assert controller.status is Status.NO_CONTACT and not forces["drag"]
     assert world.deepest > -DRAGGING.deepest - 1e-3
