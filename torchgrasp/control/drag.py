@@ -74,7 +74,8 @@ class DragController:
     pressing fingers must measure forces.
 
     Friction bends the fingers, so that the tips lag behind the palm and drift sideways. The palm
-    makes up for this along the table, so that the tips go where the plan wants them.
+    makes up for this along the table, so that the tips go where the plan wants them. It undoes this
+    while it rises, so that the fingers do not pull the object along.
 
     Args:
         plan: the drag, from `plan_edge_grasps`.
@@ -123,6 +124,7 @@ class DragController:
         self.lag = torch.zeros_like(self.way)
         self.time = 0.0
         self.missing = 0.0
+        self.straighten = 0.0
         self.targets = self._targets()
 
     @checked
@@ -140,6 +142,7 @@ class DragController:
         elif self.phase == "drag":
             self._move(observation.tips, force, period)
         elif self.phase == "up":
+            self.lag = self.lag - _shortened(self.lag, self.straighten * period)
             self.height += DRAGGING.rise * period
             if self.height >= DRAGGING.height:
                 self.phase = "done"
@@ -166,14 +169,18 @@ class DragController:
 
     def _move(self, tips: Float[Tensor, "f 3"], force: float, period: float) -> None:
         """Move along by a smooth step, with the planned force; give up if the object is lost."""
-        behind = (self.tips - tips)[self.presses].mean(0)
-        behind = behind - (behind @ self.up) * self.up
+        bent = (tips - self.tips)[self.presses].mean(0)
+        depth = float(bent @ self.up)
+        behind = depth * self.up - bent
         more = _shortened(behind - self.lag, DRAGGING.catching * period)
         self.lag = _shortened(self.lag + more, DRAGGING.lag)
         self.time += period
         self.share = min(self.time * DRAGGING.speed / float(norm(self.way)), 1.0)
         self.height += self._speed(force, True) * period
         self.missing = 0.0 if force > DRAGGING.felt else self.missing + period
+        # while the hand rises, all bends shrink at one rate, and so do the forces: the object stays
+        size = float(norm(self.lag))
+        self.straighten = DRAGGING.rise * size / max(depth, size, DRAGGING.agree)
         if self.share >= 1.0:
             self.phase = "up"
         self._give_up(self.missing > DRAGGING.lost or self.height < -DRAGGING.deepest)
@@ -194,4 +201,5 @@ class DragController:
 
 def _shortened(vector: Float[Tensor, "3"], most: float) -> Float[Tensor, "3"]:
     """Return a vector, shortened to the length `most` if it is longer."""
-    return vector * (most / max(float(norm(vector)), most))
+    length = float(norm(vector))
+    return vector if length <= most else vector * (most / length)
