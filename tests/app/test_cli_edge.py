@@ -65,7 +65,7 @@ def test_a_low_box_is_dragged_to_the_edge_if_more_success_is_predicted_there(
     assert 0.12 < x < 0.15 and z == 0.0
     assert (
         f"{1e3 * math.hypot(x, y):.0f} mm along (" in err
-        and "at the edge: dragged to the edge" in err
+        and "with the drag: dragged to the edge" in err
     )
     fingers = " and ".join(drag["feet_m"])
     assert f"drag first  {fingers} press" in err and f"{drag['force_n']:.1f} N" in err

@@ -17,7 +17,7 @@ from torchgrasp.control.drag import DRAGGING, DragController
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.ik.press import press_postures
-from torchgrasp.planner.edge import DragPlan, _is_steady
+from torchgrasp.planner.drag_plan import DragPlan, _is_steady
 
 PERIOD = 0.01
 THICK = 0.01

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgrasp.data.accept import HandLike, SeenLike, as_hand, as_seen
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse, rigid
@@ -61,6 +61,19 @@ class EdgePlan(Value):
     grasps: Grasps
     shape: ShapeGP
     reason: str = ""
+
+    @property
+    def success(self) -> float:
+        """The predicted success of the first grasp, in [0, 1], times that of the drag.
+
+        The latter is the share of simulated drags that ended as planned (`DRAG.ended`). The result
+        is 0 without an executable grasp, and NaN if its success is unknown.
+        """
+        good = self.grasps[self.grasps.status == Status.OK]
+        if not len(good):
+            return 0.0
+        sure = 1.0 if self.drag is None else DRAG.ended[int(self.drag.presses.sum()) - 1]
+        return sure * float(good.success[0])
 
 
 @checked

@@ -17,7 +17,6 @@ from benchmarks.common import Options, Row, bench, run_all
 from benchmarks.headline.lifts import HIGHEST, LOW, LOW_BODIES
 from torchgrasp import (
     ContactSpec,
-    Grasps,
     GraspTask,
     Hand,
     Plane,
@@ -102,12 +101,12 @@ def lift_body(
         )
         for table in corner(mesh.bounds, own)
     ]
-    best = max(plans, key=predicted)
+    best = max(plans, key=lambda plan: plan.success)
     where = "table" if best.drag is None else "edge"
     if not best.grasps.status.eq(Status.OK).any():
         return where, 0, "no grasp", math.nan
     lift = lift_from_edge(best, hand, mesh, trial, own, tries=BASE.tries, parts=convex_parts(mesh))
-    return where, tries_to_rise(lift, trial), why_lost(lift), predicted(best)
+    return where, tries_to_rise(lift, trial), why_lost(lift), best.success
 
 
 def plan_here(cloud: PointCloud, hand: Hand, trial: TrialSpec, starts: int, seed: int) -> EdgePlan:
@@ -136,12 +135,6 @@ def corner(bounds: np.ndarray, seed: int) -> list[Plane]:
         reach = float((corners @ outward).max())
         tables.append(Plane.horizontal(0.0).ending((reach + GAP) * outward, outward))
     return tables
-
-
-def predicted(plan: EdgePlan) -> float:
-    """Return the predicted success of a plan's first grasp; 0 without an executable one."""
-    good: Grasps = plan.grasps[plan.grasps.status == Status.OK]
-    return float(good.success[0]) if len(good) else 0.0
 
 
 def tries_to_rise(lift: EdgeLift, trial: TrialSpec) -> int:

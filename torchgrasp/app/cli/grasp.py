@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 import functools
 import json
+import math
 from pathlib import Path
 from typing import Any, Literal
 
@@ -339,11 +340,10 @@ class Grasp(ForPrograms):
         if plan.drag is None:
             progress.end("drag", f"none: {plan.reason}")
             return None
-        found = " and ".join(
-            f"{describe_best(grasps)} {where}"
-            for grasps, where in ((stands, "where it stands"), (plan.grasps, "at the edge"))
-        )
-        better = rank_best(plan.grasps) > rank_best(stands)
+        sure = 0.0 if math.isnan(plan.success) else plan.success
+        found = f"{describe_best(stands)} where it stands, {describe_best(plan.grasps)} at the edge"
+        found += f", {sure:.0%} with the drag"
+        better = rank_best(plan.grasps) >= 0 and sure > rank_best(stands)
         progress.end("drag", f"{found}: {'dragged to the edge' if better else 'it stays'}")
         return plan if better else None
 
