@@ -283,9 +283,8 @@ class _Drag:
         wanted = self.plan.displacement
         if not bool(torch.isfinite(moved).all()):
             status = Status.UNSTABLE
-        elif status is Status.OK:
-            if after[2] < before[2] - TRIAL.fallen or moved[2, 2] < math.cos(TRIAL.tipped):
-                status = Status.DROPPED
+        elif after[2] < before[2] - TRIAL.fallen or moved[2, 2] < math.cos(TRIAL.tipped):
+            status = Status.DROPPED
         motion = self.obj_from_world @ moved @ inverse(self.obj_from_world)
         return DragResult(
             status,
