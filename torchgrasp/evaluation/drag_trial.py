@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.cloud.agreement import check_stand
+from torchgrasp.cloud.agreement import AGREEMENT, check_contacts, check_stand
 from torchgrasp.control.drag import DRAGGING, DragController
 from torchgrasp.control.finger_forces import drive_stiffness, stiff_drives
 from torchgrasp.control.reference import ClosingReference
@@ -19,7 +19,7 @@ from torchgrasp.data.shipped import GraspObject
 from torchgrasp.evaluation.frame import moved_mesh, rounded, world_frame
 from torchgrasp.evaluation.protocols import draw_trial
 from torchgrasp.evaluation.several_tries import LiftTry, lift_grasps
-from torchgrasp.evaluation.trial import GraspTrial, Truth
+from torchgrasp.evaluation.trial import TRIALS, GraspTrial, Truth
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
@@ -157,7 +157,8 @@ class EdgeLift(NamedTuple):
 
     Attributes:
         drag: record of the drag; None if the plan has none.
-        tries: the tries of the lift (`lift_grasps`); empty if the drag failed.
+        tries: the tries of the lift (`lift_grasps`). Empty if the drag failed, or left the object so
+            far off that most contacts of the grasps are not on it.
     """
 
     drag: DragResult | None
@@ -226,6 +227,10 @@ def lift_from_edge(
             return EdgeLift(drag, ())
         motion = drag.motion.numpy()
         solid, *pieces = (x.copy().apply_transform(motion) for x in (solid, *pieces))
+        try:
+            check_contacts(good, solid, TRIALS.slack, AGREEMENT.astray)
+        except BadArgument:  # the drag is to blame, not the caller
+            return EdgeLift(drag, ())
     truth = Truth(solid, pieces, table=table)
     trial = GraspTrial(hand, good, truth, seed, surface=surface_field(plan.shape))
     return EdgeLift(drag, lift_grasps(trial, _choose(spec), tries))
@@ -319,7 +324,7 @@ class _Drag:
         wanted = self.plan.displacement
         if not bool(torch.isfinite(moved).all()):
             status = Status.UNSTABLE
-        elif status is Status.OK:
+        else:
             vertices = moved[2, :3].numpy() @ self.vertices.T + float(moved[2, 3])
             if vertices.min() < -TRIAL.below or moved[2, 2] < math.cos(TRIAL.tipped):
                 status = Status.DROPPED
