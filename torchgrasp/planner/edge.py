@@ -72,7 +72,7 @@ class EdgePlan(Value):
         good = self.grasps[self.grasps.status == Status.OK]
         if not len(good):
             return 0.0
-        sure = 1.0 if self.drag is None else DRAG.ended[int(self.drag.presses.sum()) - 1]
+        sure = 1.0 if self.drag is None else DRAG.ended
         return sure * float(good.success[0])
 
 
