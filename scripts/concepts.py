@@ -1,6 +1,6 @@
 #!/usr/bin/env python
-"""Draw the pictures of docs/concepts.md and docs/uncertainty.md: a slice through a band of
-uncertainty, contacts with and without closure, and what each uncertainty costs.
+"""Draw the pictures of docs/concepts.md, docs/uncertainty.md and docs/edge.md: a slice through a band
+of uncertainty, contacts with and without closure, what each uncertainty costs, and a drag.
 
 python scripts/concepts.py [--out docs]
 """
@@ -14,6 +14,7 @@ from typing import NamedTuple
 import matplotlib
 import numpy as np
 import torch
+import trimesh
 import tyro
 
 from torchgrasp import (
@@ -21,15 +22,23 @@ from torchgrasp import (
     Contacts,
     ContactSpec,
     Distribution,
+    Plane,
     certify,
     critical_friction,
     fit_shape,
     hold_probability,
+    load_hand,
     load_object,
+    plan_edge_grasps,
 )
+from torchgrasp.app.report.canvas import OBJECT, Camera, Canvas, frame_camera
+from torchgrasp.app.report.solids import solids_from_hand
+from torchgrasp.app.report.stills import add_solids
+from torchgrasp.cloud import look_at, partial_view
 from torchgrasp.contacts.critical import least_balance
 from torchgrasp.contacts.form_closure import centre_and_radius, with_torque
 from torchgrasp.data.shipped import load_shipped_grasp
+from torchgrasp.geometry.frames import rigid
 from torchgrasp.geometry.linalg import dot, unit
 
 matplotlib.use("Agg")
@@ -127,6 +136,81 @@ def draw_certificates(path: Path) -> None:
     draw_contacts(right, (30.0, 90.0, 150.0))
     figure.savefig(path)
     plt.close(figure)
+
+
+SLAB = "#b4c0cc"
+"""Colour of the table in the picture of a drag."""
+
+SHOT = (960, 660)
+"""Width and height [pixels] of a picture of a drag."""
+FRONT = np.array([0.0, -0.055, 0.0])
+"""Place [m] of the arrow of the drag: in front of the box."""
+
+
+class Panel(NamedTuple):
+    """A picture of a drag: its title, the hand's joints and pose, and how far the object is [m]."""
+
+    title: str
+    joints: torch.Tensor
+    pose: torch.Tensor
+    moved: np.ndarray
+
+
+def draw_drag(path: Path) -> None:
+    """Draw how a hand drags a low box over the edge of a table and pinches it there."""
+    box = trimesh.creation.box([0.12, 0.06, 0.01]).apply_translation([0.0, 0.0, 0.005])
+    cloud = partial_view(box, look_at(-135.0, 40.0, target=box))
+    hand = load_hand("barrett")
+    x = torch.tensor([1.0, 0.0, 0.0])
+    spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.15 * x, x))
+    plan = plan_edge_grasps(cloud, hand, spec, starts=100)
+    drag, grasp = plan.drag, plan.grasps.best
+    assert drag is not None
+    shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
+    way = drag.displacement.numpy()
+    panels = (
+        Panel("1. press from above", drag.joints, drag.obj_from_hand, 0 * way),
+        Panel("2. drag it over the edge", drag.joints, shift @ drag.obj_from_hand, way),
+        Panel("3. pinch what hangs over", grasp.joints[0], grasp.obj_from_hand[0], way),
+    )
+    slab = trimesh.creation.box([0.27, 0.16, 0.02]).apply_translation([0.015, 0.0, -0.01])
+    hands = [
+        solids_from_hand(hand, hand.expand_joints(x.joints), hand.tree.joint_names, x.pose)
+        for x in panels
+    ]
+    corners = np.concatenate([slab.vertices, *(s.vertices for solids in hands for s in solids)])
+    camera = frame_camera(corners, (0.3, -1.0, 0.1), size=SHOT)
+    begin, end = project(np.stack([0 * way, way]) + FRONT, camera)
+    shots = []
+    for panel, solids in zip(panels, hands, strict=True):
+        canvas = Canvas()
+        canvas.add_mesh(slab.vertices, slab.faces, SLAB)
+        canvas.add_mesh(box.vertices + panel.moved, box.faces, OBJECT)
+        if panel.moved.any():
+            canvas.add_mesh(box.vertices, box.faces, OBJECT, transparent=True)
+        add_solids(canvas, solids)
+        shots.append(canvas.render(camera, SHOT))
+    # all three are cut to what any of them shows
+    drawn = np.any(np.stack(shots) != shots[0][0, 0], axis=(0, 3))
+    left, *_, right = np.flatnonzero(drawn.any(0))
+    top, *_, bottom = np.flatnonzero(drawn.any(1))
+    figure, all_axes = plt.subplots(1, 3, figsize=(10.0, 2.0), dpi=110, layout="constrained")
+    for axes, panel, shot in zip(all_axes, panels, shots, strict=True):
+        axes.imshow(shot)
+        axes.set(xlim=(left, right), ylim=(bottom, top))
+        if panel.title.startswith("2"):
+            axes.annotate("", end, begin, arrowprops={"arrowstyle": "-|>", "linewidth": 1.6})
+        axes.set_title(panel.title, fontsize=11, color=INK)
+        axes.set_axis_off()
+    figure.savefig(path, pil_kwargs={"quality": 88})
+    plt.close(figure)
+
+
+def project(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the pixels (n, 2) of points (n, 3) [m] in a picture of the size `SHOT`."""
+    right, up, back = camera.frame @ (points - camera.position).T
+    scale = SHOT[1] / (2 * math.tan(camera.angle / 2))
+    return np.stack([SHOT[0] / 2 - scale * right / back, SHOT[1] / 2 + scale * up / back], -1)
 
 
 LAW = Distribution.between(0.1, 0.6)
@@ -270,6 +354,7 @@ def main(out: Path = Path(__file__).parents[1] / "docs") -> None:
     draw_band(out / "concepts_band.png")
     draw_certificates(out / "concepts_certificate.png")
     draw_sources(out / "uncertainty_sources.png")
+    draw_drag(out / "edge.jpg")
 
 
 if __name__ == "__main__":

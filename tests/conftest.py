@@ -44,7 +44,8 @@ settings.load_profile("short")  # `--hypothesis-profile=long` chooses the other
 
 
 SIMULATED = re.compile(
-    r"(close_hand|evaluate|drop|lift_grasp|open_scene|pull_grasp|run_protocol|open)\("
+    r"\b(close_hand|drag_object|evaluate|drop|lift_from_edge|lift_grasps?|open_scene|pull_grasp|"
+    r"run_protocol|open)\("
 )
 """What an example calls that opens a simulator."""
 

@@ -20,6 +20,7 @@ from tests.hostile.samples import hints_of
 from tests.hostile.unchanged import digest
 from tests.settings import changed, other_settings
 from torchgrasp import Contacts, ContactSpec, certify, load_hand, load_object, stream_grasps
+from torchgrasp.control import DragController
 from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
@@ -59,7 +60,7 @@ def outcome(call: Any, given: dict[str, Any], mode: AbstractContextManager[Any])
     others.
     """
     owner = getattr(call, "__self__", None)
-    if isinstance(owner, Value):
+    if isinstance(owner, Value | DragController):  # a controller goes on with each step
         call = getattr(copy.deepcopy(owner), call.__name__)
     given = copy.deepcopy(given)
     try:

@@ -44,6 +44,7 @@ with _uncollected():
     from torchgrasp.ik.solve import solve_ik
     from torchgrasp.success.task import GraspTask
     from torchgrasp.success.reasons import explain_success
+    from torchgrasp.planner.edge import plan_edge_grasps
     from torchgrasp.planner.explain import explain_empty
     from torchgrasp.planner.grasps import plan_grasps, stream_grasps
     from torchgrasp.planner.scene_plan import plan_scene
@@ -103,6 +104,7 @@ __all__ = [
     "stream_grasps",
     "explain_empty",
     "plan_scene",
+    "plan_edge_grasps",
     "ClosingReference",
     "GraspController",
     "closing_gains",

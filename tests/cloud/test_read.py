@@ -19,6 +19,7 @@ from torchgrasp.foundation.errors import (
     SuspiciousScale,
     TooFewPoints,
 )
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
 
 
@@ -50,6 +51,13 @@ def test_a_saved_cloud_reads_back(tmp_path, points, fields, suffix, tolerance):
             assert found.dtype == torch.float64
             # float32 of the file: relative 6e-8
             assert (wanted - found).abs().max() <= tolerance * (10 if name == "normals" else 1)
+
+
+def test_no_file_of_a_cloud_holds_the_edge_of_its_table(tmp_path, points):
+    table = Plane.horizontal(0.0).ending(torch.zeros(3), torch.tensor([1.0, 0.0, 0.0]))
+    with pytest.raises(BadArgument, match=r"table: expected .*got a table with an edge"):
+        save_cloud(PointCloud(torch.from_numpy(points)), tmp_path / "cloud.npz", table)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])

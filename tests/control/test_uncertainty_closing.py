@@ -159,26 +159,40 @@ def test_targets_stay_near_the_joints_but_late_fingers_search_and_press_harder()
     assert last.abs().max() > 1.5 * CLOSING.lead  # the joints do not follow, as if blocked
 
 
+def searched(table: Plane | None) -> torch.Tensor:
+    """The tips (3, 3) of fingers that search along x, beyond their contacts."""
+    law = UncertaintyClosing(dataclasses.replace(reference(), table=table), RIGID_ARM)
+    joints = torch.zeros(9).double()
+    for _ in range(200):
+        at = TARGET + 0.02 * NORMALS + joints.reshape(3, 3)
+        joints = law(dataclasses.replace(observation(joints=joints), tips=at), PERIOD)
+    return at
+
+
+@pytest.mark.parametrize("edge", [False, True])
 @pytest.mark.parametrize("up", [1.0, -1.0])
-def test_searching_finger_stays_above_the_table(up):
-    """The fingers search along x, beyond their contacts; the table is across x, 5 mm behind the
-    contacts above it.
-    """
+def test_searching_finger_stays_above_the_table_or_beyond_its_edge(up, edge):
+    """The table or its edge is across x, 5 mm behind the contacts above it."""
     above = NORMALS[:, 0] == up
-    table = Plane(real([up, 0, 0]), float(up * TARGET[above, 0].mean()) - 0.005)
-    low, free = (dataclasses.replace(reference(), table=t) for t in (table, None))
-    tips = {}
-    for name, known in (("low", low), ("free", free)):
-        law = UncertaintyClosing(known, RIGID_ARM)
-        joints = torch.zeros(9).double()
-        for _ in range(200):
-            at = TARGET + 0.02 * NORMALS + joints.reshape(3, 3)
-            joints = law(dataclasses.replace(observation(joints=joints), tips=at), PERIOD)
-        tips[name] = at[:, 0] * up
-    height = tips["low"] - table.offset - 0.01
+    side = Plane(real([up, 0, 0]), float(up * TARGET[above, 0].mean()) - 0.005)
+    table = Plane(real([0, 0, 1]), 1.0, side) if edge else side
+    low, free = (up * searched(t)[:, 0] for t in (table, None))
+    height = low - side.offset - 0.01
     assert float(height[above].min()) >= 0 and float(height[above].max()) < 1e-3
-    assert float(tips["free"][above].max()) < table.offset
-    assert float(tips["low"][~above].min()) > float(-0.03 + 0.01)
+    assert float(free[above].max()) < side.offset
+    assert float(low[~above].min()) > float(-0.03 + 0.01)
+
+
+def test_an_edge_far_from_the_fingers_changes_nothing():
+    """To the last bit: where the table goes on, it is as without an edge; where it ended long ago,
+    as if it were far below.
+    """
+    above = NORMALS[:, 0] == 1.0
+    table = Plane(real([1, 0, 0]), float(TARGET[above, 0].mean()) - 0.005)
+    there, here = (Plane(real([0, 1, 0]), offset) for offset in (1.0, -1.0))
+    assert torch.equal(searched(dataclasses.replace(table, edge=there)), searched(table))
+    deep = dataclasses.replace(table, offset=-10.0)
+    assert torch.equal(searched(dataclasses.replace(table, edge=here)), searched(deep))
 
 
 def test_fingers_slide_along_the_table_to_the_rim_of_a_low_object():
@@ -199,6 +213,12 @@ def test_fingers_slide_along_the_table_to_the_rim_of_a_low_object():
     paths = []
     assert law.low.all() and not rim_contacts(dataclasses.replace(low, table=None)).any()
     assert not rim_contacts(dataclasses.replace(low, normals=NORMALS)).any()
+    ending = (Plane(real([1, 0, 0]), x) for x in (1.0, 0.0, -1.0))  # where the table ends along x
+    rims = [
+        rim_contacts(dataclasses.replace(low, table=dataclasses.replace(low.table, edge=edge)))
+        for edge in ending
+    ]
+    assert rims[0].all() and torch.equal(rims[1], NORMALS[:, 0] < 0) and not rims[2].any()
     for _ in range(150):
         paths.append(
             rim + 0.01 * normals + real([0, 0, 0.006]) + 0.012 * NORMALS + joints.reshape(3, 3)

@@ -204,6 +204,10 @@ def test_the_next_try_finds_all_bodies_where_the_last_left_them():
     for body in (truth.mesh, *truth.parts):
         assert torch.allclose(torch.tensor(body.vertices), expected, atol=1e-12)
     assert truth.table.describe() == Plane.horizontal(0.0).describe()
+    ending = Plane.horizontal(0.0).ending(real([0.01, 0, 0]), real([1.0, 0, 0]))
+    planned = dataclasses.replace(first.grasp[0], meta={"table": ending.describe()})
+    on_edge = _left_behind(dataclasses.replace(first, grasp=planned), result, felt, two)
+    assert on_edge.table.describe() == ending.describe()
     off = apply_error(one, aside) @ inverse(
         one
     )  # of the hand's true from its believed pose, in the world

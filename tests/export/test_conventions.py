@@ -231,6 +231,10 @@ def test_a_hand_that_our_file_raises_is_raised_again(tmp_path):
     file.write_text(json.dumps(content))
     read = read_foreign(file, hand)
     assert grasps_from_joints(hand, *read).table.offset == -0.05
+    content["provenance"]["table"] += "; edge normal 1 0 0, offset 0.3"
+    file.write_text(json.dumps(content))
+    edge = read_foreign(file, hand).table.edge
+    assert edge.normal.tolist() == [1.0, 0.0, 0.0] and edge.offset == 0.3
     content["provenance"]["table"] = "none"
     file.write_text(json.dumps(content))
     with pytest.warns(GraspFileWarning, match="no table"):

@@ -393,6 +393,39 @@ def test_a_tilted_table_is_level_in_the_folder(tmp_path):
     assert play["object"]["centre"][2] == pytest.approx(float(thing.mesh.center_mass[2]), abs=1e-5)
 
 
+def test_mujoco_plays_on_a_table_that_ends_and_other_players_refuse_it(tmp_path):
+    import mujoco
+
+    thing = load_object("jug")
+    hand = load_hand("barrett")
+    grasp = load_shipped_grasp("jug", "barrett")
+    turn = rigid(
+        rotation_from_vector(torch.tensor([0.4, -0.2, 0.3], dtype=torch.float64)),
+        torch.full((3,), 0.1).double(),
+    )
+    point, outward = torch.tensor([[0.02, 0.0, 0.0], [1.0, 0.5, 0.0]], dtype=torch.float64)
+    table = Plane.horizontal(0.0).ending(point, outward).moved(turn)
+    moved = move(grasp.to(torch.float64), turn)
+    moved = dataclasses.replace(moved, meta=grasp.meta | {"table": table.describe()})
+    mesh = thing.mesh.copy().apply_transform(turn.numpy())
+    for player in LIBRARIES.keys() - {"mujoco"}:
+        with pytest.raises(BadArgument, match=r"player: expected .*got .* a table with an edge"):
+            save_play(hand, moved, tmp_path, player, mesh, SPEC, parts=[mesh.convex_hull])
+    assert not list(tmp_path.iterdir())
+    save_play(hand, moved, tmp_path, "mujoco", mesh, SPEC, parts=[mesh.convex_hull])
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    top = model.geom("torchgrasp_table").id
+    axes = data.geom_xmat[top].reshape(3, 3)
+    body = json.loads((tmp_path / "play.json").read_text())["object"]
+    # the face of the box in its first direction is as far from the object as the edge
+    face = (data.geom_xpos[top] - body["centre"]) @ axes[:, 0] + model.geom_size[top, 0]
+    mass_centre = torch.from_numpy(np.array(mesh.center_mass))
+    assert face == pytest.approx(-float(table.edge.height(mass_centre)), abs=1e-4)
+    assert data.geom_xpos[top, 2] + model.geom_size[top, 2] == pytest.approx(0.0, abs=1e-5)
+
+
 def test_an_export_that_cannot_play_says_why(tmp_path, capsys):
     hand = load_hand("barrett")
     grasp = load_shipped_grasp("jug", "barrett")

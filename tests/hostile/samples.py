@@ -31,7 +31,7 @@ from torchgrasp import (
 from torchgrasp.arm import Arm
 from torchgrasp.cloud import estimate_normals
 from torchgrasp.contacts import ShapeLike
-from torchgrasp.control import GraspTry, no_contact, observe
+from torchgrasp.control import DragController, GraspTry, no_contact, observe
 from torchgrasp.control.paper.closings import Impedance
 from torchgrasp.control.paper.stability import NAMES, StabilityModel
 from torchgrasp.data.shipped import load_shipped_grasp
@@ -39,6 +39,7 @@ from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import Range
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.ik import GraspProblem, PostureLibrary
+from torchgrasp.planner import DragPlan
 from torchgrasp.planner.explain import Funnel, Losses
 from torchgrasp.posture_model import GaussianMixture, SampleSpec, write_samples
 from torchgrasp.posture_model.dataset import SampleFolder
@@ -114,6 +115,7 @@ def special(kind: type) -> Any:
             {name: nothing for name in ("__init__", *SimulatedScene.__abstractmethods__)},
         ),
         SimulatedHand: simulated_hand,
+        DragController: lambda: DragController(pressing_drag(), special(torchgrasp.Hand)),
         torchgrasp.Plane: lambda: torchgrasp.Plane.horizontal(0.0),
         torchgrasp.Distribution: lambda: torchgrasp.Distribution.between(0.1, 1.0),
         torchgrasp.ShapeGP: lambda: fit_shape(special(PointCloud), budget=30),
@@ -155,6 +157,21 @@ def simulated_hand() -> SimulatedHand:
     scene.timestep = 0.002
     scene.joint_names = reference.hand.tree.joint_names
     return SimulatedHand(scene, reference, 50.0, None)
+
+
+def pressing_drag() -> DragPlan:
+    """Return a drag in which all fingertips press, each on a point right below it."""
+    hand = special(torchgrasp.Hand).to("cpu", torch.float64)
+    drag = sample(DragPlan, Path())
+    joints = (hand.lower + hand.upper) / 2
+    down = hand.tips.radius[:, None] * drag.table.normal
+    return dataclasses.replace(
+        drag,
+        joints=joints,
+        obj_from_hand=torch.eye(4, dtype=torch.float64),
+        presses=torch.ones(len(hand.tips), dtype=torch.bool),
+        feet=hand.tip_centres(joints) - down,
+    )
 
 
 def grasp_problem() -> GraspProblem:

@@ -1,5 +1,6 @@
 """The simulated scene against statics, rigid-body formulae and the hand's own kinematics."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -22,6 +23,7 @@ from torchgrasp.sim.scene_spec import (
     mounted_urdf,
 )
 from torchgrasp.sim.simulated_hand import open_scene
+from torchgrasp.sim.simulated_scene import TABLETOP
 
 
 def test_euler_angles_rebuild_the_rotation():
@@ -247,3 +249,83 @@ def test_yielding_mount_shifts_and_lifts_the_hand(simulator):
     moved = scene.hand_pose() - world_from_hand.numpy()
     assert moved[:3, 3] == pytest.approx([0.02, -0.01, 0.055], abs=1e-4)
     assert np.abs(moved[:3, :3]).max() < 1e-5
+
+
+AWAY = np.array([math.cos(0.7), math.sin(0.7)])  # a general direction beyond a table's edge
+
+
+def slab(beyond):
+    """A flat block at a height of 0.2 m, whose mass centre is `beyond` [m] the edge at 0.3 m."""
+    mesh = trimesh.creation.box((0.1, 0.06, 0.02))
+    mesh.apply_translation([*(0.3 + beyond) * AWAY, 0.21])
+    return mesh
+
+
+@simulated
+def test_a_block_falls_over_the_edge_if_its_mass_centre_is_beyond(simulator):
+    for beyond, falls in ((-0.04, False), (-0.002, False), (0.002, True), (0.02, True)):
+        *_, scene = build("barrett", slab(beyond), simulator, edge=(*AWAY, 0.3))
+        for _ in range(400):
+            scene.step()
+        pose = scene.object_pose()
+        if falls:
+            assert pose[2, 3] < -0.2
+        else:
+            assert pose == pytest.approx(np.eye(4), abs=3e-3)
+
+
+@simulated
+def test_a_rocking_cylinder_comes_to_rest_on_a_table_with_an_edge(simulator):
+    """As on one without an edge, it stands up in the end."""
+    turn = trimesh.transformations.euler_matrix(0.15, 0.05, 0.0)
+    mesh = trimesh.creation.cylinder(radius=0.03, height=0.12)
+    mesh.apply_transform(turn)
+    mesh.apply_translation([0, 0, 0.2 - mesh.bounds[0, 2]])
+    *_, scene = build("barrett", mesh, simulator, edge=(*AWAY, 0.1))
+    for _ in range(1000):
+        scene.step()
+    assert (scene.object_pose()[:3, :3] @ turn[:3, 2])[2] == pytest.approx(1.0, abs=1e-3)
+
+
+@simulated
+def test_a_hand_beyond_the_edge_is_below_the_table_and_touches_nothing(simulator):
+    """The table's top is above the hand, which is at x = 0.05 m."""
+    for offset, touches in ((-0.3, False), (0.05, True)):
+        mesh = standing()
+        mesh.apply_translation([-1.0, 0.0, 0.5])
+        *_, scene = build("barrett", mesh, simulator, edge=(1.0, 0.0, offset), gravity=0.0)
+        assert (scene.penetration() > 1e-3) == touches
+        if not touches:
+            strays = [scene.step().stray[TABLETOP] for _ in range(20)]
+            assert not any(strays)
+
+
+@pytest.mark.parametrize("offset", [0.3, 0.29, -5.0, 50.0])
+def test_a_table_with_an_edge_is_a_box_around_all_that_is_near(offset):
+    mesh = slab(0.0)
+    spec = SceneSpec("", np.eye(4), {}, {}, (), mesh, [mesh], 0.1, edge=(*AWAY, offset))
+    ledge = spec.ledge
+    assert ledge.axes.T @ ledge.axes == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(ledge.axes) == pytest.approx(1.0)
+    near = np.random.default_rng(0).uniform(-0.45, 0.45, (4000, 3)) + mesh.bounds.mean(0)
+    boxed = (np.abs((near - ledge.centre) @ ledge.axes) < ledge.half).all(1)
+    assert np.array_equal(boxed, (near[:, 2] < 0.2) & (near[:, :2] @ AWAY < offset))
+    assert offset > 1.0 or not boxed.all()
+    with pytest.raises(BadArgument, match=r"edge: .*a vector of length 2"):
+        dataclasses.replace(spec, edge=(0.0, 2.0, offset))
+
+
+def test_only_vertices_behind_the_edge_are_moved_up_to_the_table():
+    """A block that stands on the table has a hook that hangs down beyond the edge."""
+    mesh = slab(0.0)
+    hook = trimesh.creation.box((0.01, 0.01, 0.05))
+    hook.apply_translation([*0.34 * AWAY, 0.19])
+    bump = trimesh.creation.box((0.01, 0.01, 0.0104))
+    bump.apply_translation([*0.27 * AWAY, 0.205])
+    args = "", np.eye(4), {}, {}, (), mesh, [mesh, hook, bump], 0.1
+    hulls = SceneSpec(*args, height=0.2, edge=(*AWAY, 0.3)).hulls[0]
+    assert np.array_equal(hulls[1], hook.vertices)
+    for found, part in ((hulls[0], mesh), (hulls[2], bump)):
+        assert found[:, 2].min() == 0.2
+        assert np.abs(found - part.vertices).max() < 3e-4
+    assert SceneSpec(*args, height=0.2).hulls[0][1][:, 2].min() == 0.2

@@ -17,7 +17,7 @@ from torchgrasp.foundation.base import flatnonzero, in_chunks
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.optim import SOLVED
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, level
 from torchgrasp.ik.motion import APPROACH_DISTANCE, COARSE_STEPS, UP, opened_pose
 from torchgrasp.values.planning import Grasps
 
@@ -200,7 +200,7 @@ def _is_clear(arm: Arm, path: Float[Tensor, "g w n"], world: CollisionWorld) -> 
         # what only slides, as a base on a rail, may stand on the table
         turning = arm.tree.moves @ (1 - arm.tree.prismatic)  # (l,)
         turns = turning[arm.link[arm.moving]] > 0
-        height = along(links[:, :, turns], world.plane) - radius[turns]
+        height = level(links[:, :, turns], world.plane) - radius[turns]
         clear &= height.flatten(1).amin(1) >= world.plane.offset
     if world.field is not None:  # a lifted object is not in the way
         gap = world.field.query(links[:, : COARSE_STEPS + 2])[0] - radius

@@ -235,7 +235,8 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
         table: plane of the table in the frame of the cloud, which is written, too. None without
             one.
 
-    Raises `OutputError` if the file cannot be written, and `BadArgument` for another suffix.
+    Raises `OutputError` if the file cannot be written, and `BadArgument` for another suffix, or for
+    a table with an edge, which neither file can hold.
     `BadArgument` is also raised for a `.ply` of several views, or of a cloud with `pose_error`.
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
@@ -244,6 +245,8 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
     .ply, got cloud.txt
     """
     path = Path(path)
+    if table is not None and table.edge is not None:
+        raise BadArgument("table", "a table with an edge", "one without an edge, for a file")
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
     arrays |= {} if table is None else {"table": np.array([*table.normal.tolist(), table.offset])}
     if path.suffix.lower() not in (".npz", ".ply"):

@@ -25,6 +25,7 @@ from torch import Tensor
 from torchgrasp.contacts.form_closure import Vectors
 from torchgrasp.foundation.base import FINGERTIPS, Batch, map_tensors, spread
 from torchgrasp.geometry.linalg import dot, eye_like, norm
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.estimate import MeanJet, SurfaceJet
 from torchgrasp.values.specs import ContactSpec
@@ -279,9 +280,10 @@ class ContactProblem:
     round cone inside the friction cone with flat sides that `certify` uses. `domain_radius` is that
     of the shape. `separation` is the least distance of two fingertip centres, `tip_radius` the
     radius of the fingertips, and `ring` the radius within which the surface is flat. The table has
-    the unit normal `up` (None without a table) and the distance `floor` from the origin. `beyond`
-    returns the signed distance (q,) of normalised points (q, 3) from the region where contacts may
-    be, negative inside.
+    the unit normal `up` (None without a table) and the distance `floor` from the origin. Its edge
+    has the unit normal `outward` (None without an edge) and the distance `brink`. `beyond` returns
+    the signed distance (q,) of normalised points (q, 3) from the region where contacts may be,
+    negative inside.
     """
 
     spec: ContactSpec
@@ -293,6 +295,8 @@ class ContactProblem:
     up: Float[Tensor, "3"] | None
     floor: PerRow
     beyond: Callable[[Tensor], Tensor] | None = None
+    outward: Float[Tensor, "3"] | None = None
+    brink: PerRow = 0.0
 
     @classmethod
     def of(
@@ -304,17 +308,10 @@ class ContactProblem:
         the spec.
         """
         table = spec.plane
-        up = None
-        floor = 0.0
         sizes = shape.scale, shape.domain_radius
         scale, radius = (x if isinstance(x, Tensor) else float(x) for x in sizes)
-        if table is not None:
-            up = table.normal.to(device_of(shape))
-            foot = table.offset * table.normal
-            if isinstance(scale, Tensor):
-                floor = shape.normalise(foot.to(scale).expand(len(scale), 3)) @ up
-            else:
-                floor = float(shape.normalise(foot) @ table.normal)
+        up, floor = _normalised(shape, table)
+        outward, brink = _normalised(shape, None if table is None else table.edge)
         separation = spec.least_separation / scale
         if isinstance(separation, Tensor):
             separation = separation.clamp_min(LEAST_SIDE)
@@ -334,11 +331,13 @@ class ContactProblem:
             up,
             floor,
             beyond,
+            outward,
+            brink,
         )
 
     def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
         """Return the problem of the k contact sets with the indices `index`."""
-        names = "domain_radius", "separation", "tip_radius", "ring", "floor"
+        names = "domain_radius", "separation", "tip_radius", "ring", "floor", "brink"
         own = {name: x[index] for name in names if isinstance(x := getattr(self, name), Tensor)}
         return dataclasses.replace(self, **own) if own else self
 
@@ -348,14 +347,47 @@ class ContactProblem:
         """Return how high (normalised) each contact is above the height at which its round
         fingertip touches the table.
 
-        Without a table it is infinite. `points` are normalised, `normals` outward unit normals.
+        Without a table it is infinite. A fingertip beyond the table's edge may be lower: then the
+        result is how far it is beyond the edge. `points` are normalised, `normals` outward unit
+        normals.
         """
         if self.up is None:
             return torch.full_like(points[..., 0], math.inf)
-        up = self.up.to(points)
-        height = points @ up
-        slant = 1 - normals @ up
-        return height - spread(self.floor, height) - spread(self.tip_radius, slant) * slant
+        height = self._room(points, normals, self.up, self.floor)
+        if self.outward is None:
+            return height
+        return torch.maximum(height, self._room(points, normals, self.outward, self.brink))
+
+    def _room(
+        self,
+        points: Float[Tensor, "*b 3"],
+        normals: Float[Tensor, "*b 3"],
+        away: Float[Tensor, "3"],
+        offset: PerRow,
+    ) -> Float[Tensor, "*b"]:
+        """Return how far (normalised) each fingertip is from the plane with the unit normal `away`
+        and the `offset`.
+        """
+        away = away.to(points)
+        height = points @ away
+        slant = 1 - normals @ away
+        return height - spread(offset, height) - spread(self.tip_radius, slant) * slant
+
+    def _room_slope(
+        self, points: Vectors, normals: Vectors, centre_by_point: Float[Tensor, "b f 3 3"]
+    ) -> Vectors:
+        """Return the derivatives of the `room` of each contact by its point.
+
+        `centre_by_point` are those of its fingertip's centre.
+        """
+        assert self.up is not None
+        slope = self.up.to(points) @ centre_by_point
+        if self.outward is None:
+            return slope
+        height = self._room(points, normals, self.up, self.floor)
+        beyond = self._room(points, normals, self.outward, self.brink)
+        sideways = self.outward.to(points) @ centre_by_point
+        return torch.where((beyond > height)[..., None], sideways, slope)
 
     def sides(
         self, points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]
@@ -398,9 +430,8 @@ class ContactProblem:
             distances_by_x,
         ]
         if self.up is not None:
-            up = self.up.to(points)
             values.append((1 - INSIDE) * ROOM - self.room(points, jet.normals))
-            jacobians.append(own(-(up @ centre_by_point)))
+            jacobians.append(own(-self._room_slope(points, jet.normals, centre_by_point)))
         if self.beyond is not None:
             value, slope = self._outside(points)
             values.append((1 - INSIDE) * ROOM + value)
@@ -468,6 +499,20 @@ class ContactProblem:
         cosine = 1 / math.sqrt(1 + self.friction**2)
         excess = outward[..., 0] + cosine + CONE_MARGIN
         return excess, torch.cat([blocks.flatten(2), by_tension], 2)
+
+
+def _normalised(shape: ShapeLike, plane: Plane | None) -> tuple[Float[Tensor, "3"] | None, PerRow]:
+    """Return the unit normal of a plane, and its distance (normalised) from the origin; None and 0
+    without a plane.
+    """
+    if plane is None:
+        return None, 0.0
+    normal = plane.normal.to(device_of(shape))
+    foot = plane.offset * plane.normal
+    scale = shape.scale
+    if isinstance(scale, Tensor):
+        return normal, shape.normalise(foot.to(scale).expand(len(scale), 3)) @ normal
+    return normal, float(shape.normalise(foot) @ plane.normal)
 
 
 def _by_own_point(slope: Vectors, unknowns: int) -> Float[Tensor, "b f u"]:

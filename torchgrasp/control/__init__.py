@@ -3,6 +3,7 @@ the joints and the palm.
 """
 
 from torchgrasp.values.closing import ClosingGains, ClosingOptions
+from torchgrasp.control.drag import DragController
 from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.control.recovery import LiftCheck
 from torchgrasp.control.regrasp import GraspTry
@@ -20,6 +21,7 @@ from torchgrasp.control.tactile import (
 __all__ = [
     "ClosingGains",
     "ClosingOptions",
+    "DragController",
     "FingertipSensor",
     "GraspTry",
     "LiftCheck",

@@ -182,10 +182,7 @@ class UncertaintyClosing:
             # all fingers reach their contacts at the same time
             left = ahead.clamp_min(0.0) + POSITION_FLOOR
             velocity = velocity * (left / left.max())[:, None]
-        if reference.table is not None:
-            height = reference.table.height(tips) - reference.hand.tips.radius
-            velocity = stay_above(velocity, height, reference.table.normal)
-            velocity = slide_along(velocity, height, reference.table.normal, self.low)
+        velocity = self._beside_table(velocity, tips)
         velocity, descent = self._descend(velocity - drift, observation, period)
         self.palm = self.palm + period * (drift + descent)
         lead = self.strongest
@@ -215,6 +212,26 @@ class UncertaintyClosing:
                 way = way - (way @ table.normal) * table.normal
             drift = limit_norm(CLOSING.follows * way, PALM_SPEED)
         return self.planes.moved(self.displacement), drift
+
+    def _beside_table(
+        self, velocity: Float[Tensor, "f 3"], tips: Float[Tensor, "f 3"]
+    ) -> Float[Tensor, "f 3"]:
+        """Return the velocities [m/s] of the fingertips, limited so that none at `tips` (f, 3) [m]
+        enters the table; those of `low` ones slide along it.
+
+        A fingertip farther beyond the table's edge than above its plane keeps beyond the edge.
+        """
+        table = self.reference.table
+        if table is None:
+            return velocity
+        radius = self.reference.hand.tips.radius
+        height = table.height(tips) - radius
+        limited = stay_above(velocity, height, table.normal)
+        if table.edge is not None:
+            beyond = table.edge.height(tips) - radius
+            aside = stay_above(velocity, beyond, table.edge.normal)
+            limited = torch.where((beyond > height)[:, None], aside, limited)
+        return slide_along(limited, height, table.normal, self.low)
 
     def _descend(
         self, velocity: Float[Tensor, "f 3"], observation: Observation, period: float
@@ -276,14 +293,18 @@ def rim_contacts(reference: ClosingReference) -> Bool[Tensor, "f"]:
     """Return a mask (f,) of the contacts on the upper rim of a low object.
 
     Their normals are inclined upwards (`RIM.slope`), and the fingertips that touch them are lower
-    than `RIM.near` over the table. Without a table there are none.
+    than `RIM.near` over the table. Fingertips farther beyond the table's edge than above its plane
+    do not count. Without a table there are none.
     """
-    if reference.table is None:
+    table = reference.table
+    if table is None:
         return torch.zeros_like(reference.alive)
     normals = reference.normals
     radius = reference.hand.tips.radius
-    height = reference.table.height(reference.gains.target + radius[:, None] * normals) - radius
-    return (normals @ reference.table.normal > RIM.slope) & (height < RIM.near)
+    centres = reference.gains.target + radius[:, None] * normals
+    height = table.height(centres) - radius
+    low = (normals @ table.normal > RIM.slope) & (height < RIM.near)
+    return low if table.edge is None else low & (table.clearance(centres) - radius <= height)
 
 
 def slide_along(

@@ -1,6 +1,7 @@
 """Trials of grasps in simulation, published protocols, and the evaluation of folders of objects."""
 
 from torchgrasp.values.closing import ClosingTrace, Disturbance, ObjectMotion
+from torchgrasp.evaluation.drag_trial import DragResult, EdgeLift, drag_object, lift_from_edge
 from torchgrasp.evaluation.intervals import Share
 from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, PullSpec, find_protocol
 from torchgrasp.evaluation.pull import PullResult, pull_grasp
@@ -15,6 +16,8 @@ __all__ = [
     "PROTOCOLS",
     "ClosingTrace",
     "Disturbance",
+    "DragResult",
+    "EdgeLift",
     "EvaluationSpec",
     "GraspTrial",
     "LiftTry",
@@ -28,8 +31,10 @@ __all__ = [
     "Touch",
     "Truth",
     "ViewScore",
+    "drag_object",
     "evaluate",
     "find_protocol",
+    "lift_from_edge",
     "lift_grasps",
     "measure_touch",
     "pull_grasp",

@@ -102,7 +102,7 @@ def close_hand(
         parts: convex parts [m] of the mesh. None means the parts of a `GraspObject`, or those that
             `convex_parts` computes.
         table: the true table below the object, in the frame of the grasp. None means a level table
-            at the mesh's lowest point.
+            at the mesh's lowest point. It ends where the plan's table (`Grasps.table`) ends.
         neighbours: other bodies on the table, which the hand may push.
         told: the table that the controller knows, in the frame of the grasp. None means the table
             of the plan (`Grasps.table`).

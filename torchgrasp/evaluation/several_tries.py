@@ -14,14 +14,20 @@ from torchgrasp.control.controller import GraspController
 from torchgrasp.control.regrasp import GraspTry
 from torchgrasp.evaluation.lift import _Lift
 from torchgrasp.evaluation.protocols import apply_error, seed_of
-from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, check_truth
+from torchgrasp.evaluation.trial import (
+    GraspTrial,
+    TrialDriver,
+    TrialRun,
+    Truth,
+    check_truth,
+    level_table,
+)
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import Count
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.mesh import read_mesh
-from torchgrasp.geometry.plane import Plane
 from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene_spec import Neighbour
 from torchgrasp.values.closing import ClosureResult
@@ -164,9 +170,7 @@ def _left_behind(
     planned = trial.grasp.obj_from_hand[0].to("cpu", torch.float64)
     true = apply_error(planned, truth.error)
     error = inverse(following) @ true @ felt @ inverse(planned) @ following
-    table = truth.table
-    if table is None:
-        table = Plane.horizontal(float(read_mesh(truth.mesh).bounds[0, 2]))
+    table = level_table(trial.grasp, truth) if truth.table is None else truth.table
     bodies = Neighbour(read_mesh(truth.mesh), truth.parts), *truth.neighbours
     poses = result.object_pose[-1], *result.disturbance.neighbour_pose[-1]
     target, *others = (_moved(body, pose.numpy()) for body, pose in zip(bodies, poses, strict=True))

@@ -34,7 +34,7 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.convex_parts import read_solid
-from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
+from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec, edge_of
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 from torchgrasp.sim.simulated_scene import SimulatedScene
 from torchgrasp.values.closing import SensorModel
@@ -75,6 +75,7 @@ class Truth:
         error: pose (4, 4) [m] of the true hand in the frame of the planned hand; None means no
             error.
         table: the true table below the object. None means a level table at the mesh's lowest point.
+            It ends where the plan's table (`Grasps.table`) ends.
         neighbours: other bodies on the table, which the hand may push.
         slide: displacement (3,) [m] of the object along the table, halfway through the approach.
             None means no displacement; without an approach there is none, too.
@@ -157,7 +158,7 @@ class TrialDriver:
             known = to_frame(planned, pose)
             if told is not None:
                 told = told.moved(inverse(pose))
-                told = Plane(rounded(told.normal), round(told.offset, TRIALS.decimals))
+                told = _rounded_table(told)
         if reference is None:
             reference = derive_reference(
                 hand,
@@ -209,10 +210,21 @@ class TrialDriver:
             table=spec.table,
             patch=spec.patch,
             height=None if truth.table is None else 0.0,
+            edge=self._edge() if spec.table else None,
             neighbours=tuple(self._body(x, x.mass) for x in truth.neighbours),
             self_pairs=hand.self_pairs if spec.self_collision else (),
             yields=spec.components.palm_reach + relooked + float(rise.norm()),
         )
+
+    def _edge(self) -> tuple[float, float, float] | None:
+        """Return the edge of the true table in the simulator's frame, as `SceneSpec` takes it."""
+        trial = self.trial
+        table = trial.grasp.table if trial.truth.table is None else trial.truth.table
+        if table is None or table.edge is None:
+            return None
+        if trial.truth.table is None:
+            table = level_table(trial.grasp, trial.truth)
+        return edge_of(_rounded_table(table.moved(inverse(self.obj_from_world))))
 
     def _body(self, given: Truth | Neighbour, mass: float | None = None) -> Body:
         """Return a mesh as a body of the scene: in the simulator's frame, with its convex parts and
@@ -247,6 +259,33 @@ class TrialDriver:
         alone = {"approach": (0.0, 0.0, 0.0), "table": False, "neighbours": (), "self_pairs": ()}
         scene_spec = dataclasses.replace(self.scene_spec, joints=joints, **alone)
         return open_scene(scene_spec, self.spec.simulator).penetration()
+
+
+def level_table(grasps: Grasps, truth: Truth) -> Plane:
+    """Return the level table under the mesh of a `truth` that has no table.
+
+    It ends where the table of the `grasps` ends. Raises `BadArgument` if the plane of that edge is
+    all but level.
+    """
+    box = read_mesh(truth.mesh).bounds
+    level = Plane.horizontal(float(box[0, 2]))
+    table = grasps.table
+    if table is None or table.edge is None:
+        return level
+    centre = torch.tensor(box.mean(0).tolist(), dtype=torch.float64)
+    # the point of the edge that is next to the object
+    off = [plane.height(centre) * plane.normal.to(centre) for plane in (table, table.edge)]
+    try:
+        return level.ending(centre - off[0] - off[1], table.edge.normal)
+    except BadArgument as error:
+        found = "None, with a plan whose table ends at a level edge plane"
+        raise BadArgument("table", found, "the true table, a Plane") from error
+
+
+def _rounded_table(table: Plane) -> Plane:
+    """Return a table whose numbers, and those of its edge, are rounded."""
+    edge = None if table.edge is None else _rounded_table(table.edge)
+    return Plane(rounded(table.normal), round(table.offset, TRIALS.decimals), edge)
 
 
 def derive_reference(

@@ -241,7 +241,8 @@ def _read_table(fields: dict[str, Field], rises: np.ndarray, unit_m: float) -> P
     text = provenance["table"].text() if "table" in provenance else "none"
     if text != "none":
         table = read_plane(text)
-        return Plane(table.normal, unit_m * table.offset)
+        edge = table.edge and Plane(table.edge.normal, unit_m * table.edge.offset)
+        return Plane(table.normal, unit_m * table.offset, edge)
     if rises.any():
         warn_user(
             GraspFileWarning,

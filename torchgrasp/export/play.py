@@ -39,6 +39,7 @@ from torchgrasp.sim.scene_spec import (
     MOUNT_DRIVE,
     SceneSpec,
     Slide,
+    edge_of,
     mounted_urdf,
     pair_masks,
 )
@@ -114,7 +115,7 @@ def save_play(
 
     Raises:
         BadArgument: there are no grasps, joints are of another hand, or the grasps do not touch the
-            mesh.
+            mesh. The plan's table has an edge, and the player is not "mujoco".
         MeshError: the mesh is open or malformed.
         OutputError: a file cannot be written.
 
@@ -129,6 +130,9 @@ def save_play(
     """
     if not len(grasps):
         raise BadArgument("grasps", "none", "at least one grasp")
+    table = grasps.table
+    if table is not None and table.edge is not None and player != "mujoco":
+        raise BadArgument("player", f"{player!r}, for a table with an edge", "'mujoco'")
     hand = hand.to("cpu")
     grasps = grasps.to("cpu", torch.float64)
     spec = spec or TrialSpec()
@@ -142,7 +146,8 @@ def save_play(
     if not torch.equal(world_from_obj, torch.eye(4, dtype=torch.float64)):
         motion = world_from_obj.numpy()
         solid, *pieces = (body.copy().apply_transform(motion) for body in (solid, *pieces))
-    scene = _scene(hand, spec, solid, pieces)
+    edge = None if table is None else edge_of(table.moved(world_from_obj))
+    scene = _scene(hand, spec, solid, pieces, edge)
     write_file(folder / "object.ply", _mesh_file(solid, "ply"))
     if player in ("mujoco", "newton"):
         write_file(folder / "scene.xml", scene_mjcf(scene))
@@ -193,10 +198,14 @@ def _world_from_obj(grasps: Grasps, mesh: "trimesh.Trimesh") -> Float[Tensor, "4
 
 
 def _scene(
-    hand: Hand, spec: TrialSpec, mesh: "trimesh.Trimesh", parts: "Sequence[trimesh.Trimesh]"
+    hand: Hand,
+    spec: TrialSpec,
+    mesh: "trimesh.Trimesh",
+    parts: "Sequence[trimesh.Trimesh]",
+    edge: tuple[float, float, float] | None,
 ) -> SceneSpec:
     """Return the scene with all joints at zero, and the hand's mount along the axes of its root
-    link.
+    link. The table ends at an `edge`.
     """
     reach = spec.approach + spec.lift_height + PLAY.room
     axes = zip("xyz", AXES, strict=True)
@@ -223,6 +232,7 @@ def _scene(
         self_pairs=hand.self_pairs,
         table_friction=spec.table_friction,
         mount=tuple(slides),
+        edge=edge,
     )
 
 

@@ -41,12 +41,18 @@ class Plane(Value):
     """The plane of a table: the points p [m] with normal . p = offset. The normal points up, to the
     objects.
 
+    A table with an `edge` ends there: it fills the points below its own plane and behind the plane
+    of the edge. Fingers may then reach under what lies over the edge.
+
     Args:
         normal: unit normal (3,).
         offset: distance [m] of the plane from the origin along the normal; negative if the plane is
             below the origin.
+        edge: vertical plane through the table's edge, whose normal points away from the table. None
+            means that the table does not end. `ending` makes a table with an edge.
 
-    Raises `BadArgument` if the normal is not of unit length, or a number is not finite.
+    Raises `BadArgument` if the normal is not of unit length, or a number is not finite. It is also
+    raised for an edge that is not vertical on the table, or has an edge itself.
 
     >>> plane = Plane.horizontal(0.1)
     >>> plane.describe(), plane.height(torch.tensor([0.0, 0.0, 0.3]))
@@ -55,11 +61,20 @@ class Plane(Value):
 
     normal: Float[Tensor, "3"]
     offset: float
+    edge: "Plane | None" = None
 
     def __post_init__(self) -> None:
         length = float(norm(self.normal))
         if not abs(length - 1) < UNIT_ERROR:
             raise BadArgument("normal", f"a vector of length {length:g}", "a unit vector")
+        if self.edge is None:
+            return
+        if self.edge.edge is not None:
+            raise BadArgument("edge", "a plane with an edge of its own", "a plane without an edge")
+        cosine = float(self.normal.double() @ self.edge.normal.to(self.normal).double())
+        if abs(cosine) > UNIT_ERROR:
+            found = f"a plane at {math.degrees(math.acos(min(abs(cosine), 1.0))):.3g} degrees"
+            raise BadArgument("edge", found, "a plane at 90 degrees to the table")
 
     @classmethod
     @checked
@@ -76,6 +91,39 @@ class Plane(Value):
         return points @ self.normal.to(points) - self.offset
 
     @checked
+    def ending(self, point: Float[Tensor, "3"], outward: Float[Tensor, "3"]) -> "Plane":
+        """Return the same table with a straight `edge`, beyond which there is no table.
+
+        Args:
+            point: any point (3,) [m] on the edge.
+            outward: direction (3,) away from the table, of any length. Its part along the table
+                counts.
+
+        Raises `BadArgument` for a direction that is all but vertical.
+
+        >>> table = Plane.horizontal(0.0).ending(torch.tensor([0.3, 0, 0]), torch.tensor([1.0, 0, 0]))
+        >>> table.clearance(torch.tensor([[0.2, 0.0, -0.1], [0.35, 0.0, -0.1]]))
+        tensor([-0.1000,  0.0500])
+        """
+        normal = self.normal.double()
+        along = outward.to(normal)
+        along = along - (along @ normal) * normal
+        if not float(norm(along)) > LEAST_TILT * float(norm(outward.double())):
+            raise BadArgument("outward", "a direction off the table's plane", "one along the table")
+        along = unit(along)
+        return dataclasses.replace(self, edge=Plane(along, float(along @ point.to(along))))
+
+    @checked
+    def clearance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Return lower bounds (*b,) [m] of the distances of points (*b, 3) [m] from the table.
+
+        Without an edge they are the heights. With one they are the larger of the height and of the
+        distance beyond the edge: negative exactly inside the table. b stands for any batch axes.
+        """
+        height = self.height(points)
+        return height if self.edge is None else torch.maximum(height, self.edge.height(points))
+
+    @checked
     def moved(self, b_from_a: Pose) -> "Plane":
         """Return the same plane in another frame b, in float64.
 
@@ -83,12 +131,17 @@ class Plane(Value):
         `BadArgument` for a transform that is not rigid.
         """
         normal = b_from_a[:3, :3].double() @ self.normal.double()
-        return Plane(unit(normal), self.offset + float(normal @ b_from_a[:3, 3].double()))
+        edge = None if self.edge is None else self.edge.moved(b_from_a)
+        return Plane(unit(normal), self.offset + float(normal @ b_from_a[:3, 3].double()), edge)
 
     def describe(self) -> str:
-        """Return the normal and the offset [m] as text, such as "normal 0 0 1, offset 0.1"."""
+        """Return the normal and the offset [m] as text, such as "normal 0 0 1, offset 0.1".
+
+        Those of an edge follow, after "; edge".
+        """
         x, y, z = self.normal.tolist()
-        return f"normal {x:.9g} {y:.9g} {z:.9g}, offset {self.offset:.9g}"
+        text = f"normal {x:.9g} {y:.9g} {z:.9g}, offset {self.offset:.9g}"
+        return text if self.edge is None else f"{text}; edge {self.edge.describe()}"
 
 
 def read_plane(text: str) -> Plane:
@@ -96,12 +149,15 @@ def read_plane(text: str) -> Plane:
 
     Raises `BadArgument` for any other text.
     """
-    words = text.replace(",", "").split()
+    own, *edges = text.split("; edge ")
+    words = own.replace(",", "").split()
     try:
         x, y, z, offset = (float(words[k]) for k in (1, 2, 3, 5))
+        edge = [read_plane(part) for part in edges]
+        (beyond,) = edge or [None]
     except (ValueError, IndexError):
         raise BadArgument("table", repr(text), "'normal X Y Z, offset D'") from None
-    return Plane(torch.tensor([x, y, z], dtype=torch.float64), offset)
+    return Plane(torch.tensor([x, y, z], dtype=torch.float64), offset, beyond)
 
 
 def as_plane(table: Plane | float | None) -> Plane | None:
@@ -170,6 +226,24 @@ def upright_frame(
         eye = level[norm(level).argmax()]
     x = unit(eye - (eye @ z) * z)
     return rigid(torch.stack([x, torch.linalg.cross(z, x), z], -1), centre)
+
+
+def upright_table(
+    table: Plane | None, obj_from_upright: Float[Tensor, "4 4"]
+) -> Plane | float | None:
+    """Return a table in its upright frame: the height 0, or with an edge a plane; None without a
+    table.
+
+    `obj_from_upright` is the frame's pose, as `upright_frame` returns it with this table. The
+    numbers of an edge are rounded to multiples of `GRID`.
+    """
+    if table is None or table.edge is None:
+        return None if table is None else 0.0
+    edge = table.edge.moved(inverse(obj_from_upright))
+    outward = _round(edge.normal)
+    outward[2] = 0.0  # the edge is vertical on the table
+    offset = float(_round(real([edge.offset])))
+    return dataclasses.replace(Plane.horizontal(0.0), edge=Plane(unit(outward), offset))
 
 
 def to_upright(

@@ -214,10 +214,13 @@ def find_table(
         target: a thing on the support; None if unknown. Supports that carry it come first.
         image_up: upward direction (3,) of the camera's image, as for `find_supports`.
 
-    Raises `BadArgument` for a camera below the table, or `up` far from the table's normal;
-    `NoSupport` if none is found.
+    Raises `BadArgument` for a camera below the table, a table with an edge, or `up` far from the
+    table's normal; `NoSupport` if none is found.
     """
     plane = as_plane(table)
+    if plane is not None and plane.edge is not None:
+        allowed = "one without an edge, which `ContactSpec` alone takes"
+        raise BadArgument("table", "a table with an edge", allowed)
     direction = None if up is None else torch.as_tensor(up, dtype=torch.float64).cpu()
     if plane is None:
         return _find_under(target, points, viewpoint, direction, image_up)

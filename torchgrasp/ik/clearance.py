@@ -188,11 +188,31 @@ class CollisionWorld(Value):
         return self.obstacles is not None and self.obstacles.hard
 
 
-def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
-    """Return the coordinates [m] of `points` [m] along the unit normal of a `plane`; its offset is
-    not subtracted.
+def level(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b"]:
+    """Return the clearances [m] of `points` [m] from a `table`, plus the table's offset.
+
+    Without an edge they are the coordinates along the table's normal. With one they are those of
+    `Plane.clearance`.
     """
-    return points @ plane.normal.to(points)
+    height = points @ table.normal.to(points)
+    if table.edge is None:
+        return height
+    beyond = points @ table.edge.normal.to(points) - table.edge.offset
+    return torch.maximum(height, table.offset + beyond)
+
+
+def away(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b 3"]:
+    """Return the unit direction in which the clearance of each of `points` [m] from a `table`
+    grows: its gradient.
+
+    It is the table's normal, or the edge's where that is farther.
+    """
+    normal = table.normal.to(points).expand_as(points)
+    if table.edge is None:
+        return normal
+    height = points @ table.normal.to(points) - table.offset
+    beyond = points @ table.edge.normal.to(points) - table.edge.offset
+    return torch.where((beyond > height)[..., None], table.edge.normal.to(points), normal)
 
 
 def table_clearance(
@@ -201,7 +221,7 @@ def table_clearance(
     """Return the least clearance [m] of s spheres from a `table`; `centres` and `radius` are in
     metres.
     """
-    return (along(centres, table) - radius).amin(-1) - table.offset
+    return (level(centres, table) - radius).amin(-1) - table.offset
 
 
 def collision_cost(
@@ -222,7 +242,7 @@ def collision_cost(
         cost = cost + deficit.clamp_min_(0).square_().sum(-1)
     if world.plane is not None:
         wanted = world.plane.offset + CLEARANCE * ~spheres.touching + radius
-        deficit = wanted - along(centres, world.plane)
+        deficit = wanted - level(centres, world.plane)
         cost = cost + deficit.clamp_min_(0).square_().sum(-1)
     return cost / MILLIMETRE**2
 
@@ -266,7 +286,7 @@ def sphere_rows(
             coarse = torch.where(spheres.touching, math.inf, coarse)
         found.append(coarse)
     if world.plane is not None:
-        height = along(centres, world.plane) - radius - world.plane.offset
+        height = level(centres, world.plane) - radius - world.plane.offset
         # contacts tell how low tips are
         found.append(height + CLEARANCE * spheres.touching if tips_touch else height)
     if not found:
@@ -283,7 +303,7 @@ def sphere_rows(
         direction.append(gradient)
     if world.plane is not None:
         clearance.append(coarse[:, -1])
-        direction.append(world.plane.normal.to(centres).expand_as(points[:, -1]))
+        direction.append(away(points[:, -1], world.plane))
     clearance = torch.cat(clearance, 1)
     direction = torch.cat(direction, 1)
     direction = direction * ((clearance < CLEARANCE).to(centres) / -MILLIMETRE)[..., None]

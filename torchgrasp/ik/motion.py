@@ -17,7 +17,7 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import CollisionWorld, Obstacles, along, table_clearance
+from torchgrasp.ik.clearance import CollisionWorld, Obstacles, level, table_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.values.planning import Grasps
 
@@ -114,7 +114,7 @@ def opened_pose(
     gap = MOTION.gap
     centres = apply(obj_from_hand, hand.sphere_centres(joints))
     radius = hand.collision_spheres.radius.to(centres)
-    lowest = (along(centres, table) - table.offset - radius).amin(1)
+    lowest = (level(centres, table) - table.offset - radius).amin(1)
     needed = gap - lowest
     rise = torch.where((lowest < 0) & (needed <= MOTION.most), needed, 0.0)
     pose = obj_from_hand.clone()

@@ -16,7 +16,14 @@ from torch import Tensor
 from torchgrasp.geometry.linalg import dot, eye_like
 from torchgrasp.geometry.optim import SOLVED, LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, along, clearance_rows
+from torchgrasp.ik.clearance import (
+    CLEARANCE,
+    MILLIMETRE,
+    CollisionWorld,
+    away,
+    clearance_rows,
+    level,
+)
 from torchgrasp.ik.configuration import Configuration, ResidualRows, SpatialJacobian, differentiate
 from torchgrasp.values.planning import Contacts
 
@@ -142,8 +149,8 @@ def open_hand(
     gap = OPENING.gap + OPENING.deviations * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
     if world.plane is not None:
-        up = world.plane.normal.to(target)
-        height = along(target, world.plane)[..., None]
+        up = away(target, world.plane)
+        height = level(target, world.plane)[..., None]
         lowest = (world.plane.offset + CLEARANCE + hand.tips.radius.to(target))[:, None]
         # Exact where the table is horizontal.
         target = target - height * up + torch.maximum(height, lowest) * up

@@ -55,6 +55,12 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
         raise BadArgument(
             "spec", "a region for many clouds", "one without a region for many clouds"
         )
+    table = None if given["spec"] is None else given["spec"].plane
+    if table is not None and table.edge is not None:
+        # objects that are planned at once share their constraints
+        raise BadArgument(
+            "spec", "a table with an edge for many clouds", "one without an edge for many clouds"
+        )
     requests = [Request(cloud, **given) for cloud in clouds]
     hands = [request.hands for request in requests]  # wrong fingers are refused
     devices = {cloud.points.device for cloud in clouds}

@@ -35,7 +35,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Seed
 from torchgrasp.geometry.field_batch import FieldBatch
 from torchgrasp.geometry.frames import inverse
-from torchgrasp.geometry.plane import Plane, move, round_upright, upright_frame
+from torchgrasp.geometry.plane import Plane, move, round_upright, upright_frame, upright_table
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import GraspProblem, Reachable, ask_reachable
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
@@ -393,7 +393,7 @@ def pose(
     # the constraints of this hand's fingertips, in the upright frame
     upright = dataclasses.replace(
         spec,
-        table=None if spec.table is None else 0.0,
+        table=upright_table(spec.plane, object_.obj_from_upright),
         region=seen_from(spec.region, object_.obj_from_upright),
     )
     check_starts(shape, upright, request.starts)

@@ -36,6 +36,16 @@ def plan_request(request: Request) -> Grasps:
     return finish(request, list(_plan_batches(request)))
 
 
+def plan_shaped(object_: ShapedObject, request: Request) -> Grasps:
+    """Return the grasps of a request, as `plan_request` does, on an object that is shaped already.
+
+    The table is that of `object_`. Of several sets of fingers the first is used.
+    """
+    objects = pose(object_, request, request.hands[0], find_model(request))
+    batches = [objects.give_back(grasps) for grasps in plan_hand(objects, math.inf)]
+    return finish(request, batches)
+
+
 def stream_request(request: Request) -> Iterator[Grasps]:
     """Yield the executable grasps of each batch that has any, the best first, as soon as the batch
     ends.

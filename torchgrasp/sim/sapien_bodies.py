@@ -29,6 +29,7 @@ import numpy as np
 
 from torchgrasp.files import temporary_folder, write_file
 from torchgrasp.foundation.errors import MissingExtra
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.sim.scene_spec import (
     ARMATURE,
     MOUNT_DRIVE,
@@ -89,16 +90,29 @@ def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) ->
     scene.add_entity(entity)
 
 
-def table(sapien: Any, physx: Any, material: Any) -> Any:
-    """Return the body of the table, a half space of the given `material`.
+def table(sapien: Any, physx: Any, material: Any, spec: SceneSpec) -> Any:
+    """Return the body of the table, of the given `material`; its origin is at its height.
 
-    On a box, a rocking object would gain energy until it falls over.
+    It is a half space, or with an edge the surface of a box, in triangles. On a solid box a rocking
+    object would gain energy until it falls over.
     """
     body = physx.PhysxRigidStaticComponent()
-    top = physx.PhysxCollisionShapePlane(material)
-    # Its normal is its x axis.
-    half = math.sqrt(0.5)
-    top.set_local_pose(sapien.Pose(q=[half, 0.0, -half, 0.0]))
+    if spec.edge is None:
+        top = physx.PhysxCollisionShapePlane(material)
+        # Its normal is its x axis.
+        half = math.sqrt(0.5)
+        top.set_local_pose(sapien.Pose(q=[half, 0.0, -half, 0.0]))
+    else:
+        ledge = spec.ledge
+        box = trimesh.creation.box(2 * ledge.half)
+        corners, faces = box.vertices.astype(np.float32), box.faces.astype(np.uint32)
+        scale = np.ones(3, np.float32)
+        top = physx.PhysxCollisionShapeTriangleMesh(corners, faces, scale, material)
+        frame = np.eye(4)
+        frame[:3, :3] = ledge.axes
+        frame[:2, 3] = ledge.centre[:2]
+        frame[2, 3] = -ledge.half[2]
+        top.set_local_pose(sapien.Pose(frame))
     body.attach(top)
     return body
 

@@ -46,7 +46,7 @@ class SapienScene(SimulatedScene):
         both = 2 * spec.friction - spec.body_friction
         grip = physx.PhysxMaterial(both, both, 0.0)
         if spec.table:
-            place(sapien, self.scene, "table", table(sapien, physx, slick), spec.table_height)
+            place(sapien, self.scene, "table", table(sapien, physx, slick, spec), spec.table_height)
         solids = zip((spec.body, *spec.neighbours), spec.hulls, strict=True)
         bodies = [
             rigid_body(sapien, physx, slick, body, hulls, spec.patch) for body, hulls in solids

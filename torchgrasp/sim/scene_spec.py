@@ -15,6 +15,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Positive
+from torchgrasp.geometry.plane import UNIT_ERROR, Plane
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Urdf, read_urdf
 
@@ -43,6 +44,12 @@ class SimulationNumbers:
     """Cosine of the pitch below which roll and yaw have the same axis."""
     bits: int = 31
     """Number of bits of a collision mask: MuJoCo's masks are signed numbers of 32 bits."""
+    reach: float = 1.0
+    """Distance [m] that a table with an edge reaches from the object: a lost object ends a trial
+    sooner.
+    """
+    thickness: float = 0.5
+    """Thickness [m] of a table with an edge: hands beside it do not reach its underside."""
 
 
 SIMULATION = SimulationNumbers()
@@ -118,6 +125,9 @@ class SceneSpec:
         patch: radius [m] of a fingertip's contact patch. Torsional friction is friction x force x
             patch.
         height: height [m] of the table; None means the lowest point of the mesh.
+        edge: (x, y, offset) of a table that ends: it fills the points below its height whose
+            coordinate [m] along the horizontal unit vector (x, y) is less than the offset [m]. None
+            means that the table does not end.
         neighbours: other bodies on the table, each a `Body`.
         self_pairs: names of the two links of each pair of the hand's links that can collide.
         yields: largest displacement [m] of the mount along each axis of the world, beside approach
@@ -127,6 +137,8 @@ class SceneSpec:
             means `friction`.
         mount: all prismatic joints of the mount, each a `Slide`, from the world to the hand. None
             means those that `travel`, `approach` and `yields` need.
+
+    Raises `BadArgument` for an edge whose vector is not of unit length.
     """
 
     urdf_path: Path | str
@@ -151,6 +163,14 @@ class SceneSpec:
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     table_friction: float | None = None
     mount: "tuple[Slide, ...] | None" = None
+    edge: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.edge is None:
+            return
+        length = math.hypot(*self.edge[:2])
+        if not abs(length - 1) < UNIT_ERROR:
+            raise BadArgument("edge", f"a vector of length {length:g}", "a unit vector (x, y)")
 
     @functools.cached_property
     def urdf(self) -> Urdf:
@@ -200,20 +220,42 @@ class SceneSpec:
         return float(self.mesh.bounds[0, 2]) if self.height is None else self.height
 
     @property
+    def ledge(self) -> "Ledge":
+        """The box that is the table, if the table has an `edge`.
+
+        It is under the object and ends at the edge, or as far beyond the object as it reaches
+        elsewhere.
+        """
+        assert self.edge is not None
+        x, y, offset = self.edge
+        axes = np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
+        reach = SIMULATION.reach
+        along, across, _ = self.mesh.bounds.mean(0) @ axes
+        end = min(offset, along + reach)
+        thickness = SIMULATION.thickness
+        centre = axes @ np.array([end - reach, across, self.table_height - thickness / 2])
+        return Ledge(centre, np.array([reach, reach, thickness / 2]), axes)
+
+    @property
     def hulls(self) -> list[list[np.ndarray]]:
         """The vertices (v, 3) [m] of all convex parts: a list for the object, then one for each
         neighbour.
 
         They are in the world's frame, at the bodies' initial poses. Vertices less than 0.3 mm above
         the table, or below it, are moved onto it. Otherwise a scanned round body would roll away on
-        its facets before it is touched.
+        its facets before it is touched. Vertices that hang far below the table beyond its edge stay
+        there.
         """
         lowest = self.table_height + SIMULATION.near if self.table else -math.inf
         found = []
         for body in (self.body, *self.neighbours):
             hulls = [np.array(part.vertices, dtype=float) for part in body.parts]
             for vertices in hulls:
-                vertices[vertices[:, 2] < lowest, 2] = self.table_height
+                low = vertices[:, 2] < lowest
+                if self.edge is not None:
+                    hangs = vertices[:, :2] @ np.array(self.edge[:2]) > self.edge[2]
+                    low &= ~hangs | (vertices[:, 2] > self.table_height - SIMULATION.near)
+                vertices[low, 2] = self.table_height
             found.append(hulls)
         return found
 
@@ -224,6 +266,21 @@ class SceneSpec:
         if missing:
             found = f"no position or drive for {missing}"
             raise BadArgument("joints", found, "one for every joint of the URDF")
+
+
+class Ledge(NamedTuple):
+    """A box that is a table with an edge.
+
+    Attributes:
+        centre: its centre (3,) [m] in the world's frame.
+        half: half of its lengths (3,) [m] along its axes.
+        axes: its axes in columns (3, 3): away from the table beyond the edge, along the edge, and
+            up.
+    """
+
+    centre: np.ndarray
+    half: np.ndarray
+    axes: np.ndarray
 
 
 MOUNT_DRIVE = Actuator(effort=1e4, velocity=10.0, kp=1e4, kd=1e3)
@@ -250,6 +307,17 @@ class Slide(NamedTuple):
     lower: float
     upper: float
     start: float
+
+
+def edge_of(table: Plane) -> tuple[float, float, float] | None:
+    """Return the edge of a table that is level in the world's frame, as `SceneSpec` takes it; None
+    without one.
+    """
+    if table.edge is None:
+        return None
+    x, y, _ = table.edge.normal.tolist()
+    length = math.hypot(x, y)
+    return x / length, y / length, table.edge.offset
 
 
 def mounted_urdf(spec: SceneSpec) -> str:

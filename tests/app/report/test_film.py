@@ -11,10 +11,12 @@ import pytest
 import torch
 from PIL import Image
 
-from torchgrasp.app.report.canvas import ALARM, SHADOW, Camera, Canvas, rgb
+from torchgrasp.app.report.canvas import ALARM, PAPER, SHADOW, Camera, Canvas, rgb
 from torchgrasp.app.report.film import FILM, _list_plots, describe_film, draw_film
 from torchgrasp.app.report.run_data import explain_loss, find_loss, moments_of, moved_in_hand
 from torchgrasp.foundation.errors import Status
+from torchgrasp.geometry.frames import real
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.closing import ClosingTrace
 
 F64 = torch.float64
@@ -194,6 +196,22 @@ def test_a_shadow_lies_below_what_throws_it():
         [80, 119, 80, 119], abs=1
     )
     assert dark.sum() == pytest.approx(40 * 40, rel=0.06)
+
+
+def test_a_table_is_drawn_as_far_as_its_edge():
+    """From above, to the right of x = 0.02 m there is paper alone, without a shadow."""
+    edge = Plane.horizontal(0.0).ending(real([0.02, 0.0, 0.0]), real([1.0, 0.0, 0.0]))
+    square = np.array([[0.0, -0.02, 0.1], [0.05, -0.02, 0.1], [0.05, 0.02, 0.1], [0.0, 0.02, 0.1]])
+    around = np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.1]])
+    pictures = []
+    for table in (Plane.horizontal(0.0), edge):
+        canvas = Canvas()
+        canvas.add_table(around, table, [(square, np.array([[0, 1, 2], [0, 2, 3]]))])
+        camera = Camera(np.array([0.0, 0.0, 1.0]), np.eye(3), math.atan(0.1) * 2)
+        pictures.append(canvas.render(camera, (200, 200)).astype(int))
+    whole, cut = pictures
+    assert near(cut[:, 122:], PAPER).all() and not near(whole[:, 122:], PAPER).any()
+    assert np.array_equal(cut[:, :118], whole[:, :118]) and near(cut, SHADOW).sum() > 500
 
 
 def test_a_closing_without_the_law_has_no_panel_of_lambda(run, closing):

@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 
+from tests.make import random_motion
 from torchgrasp.app.report.page import format_page
 from torchgrasp.app.report.solids import EDGE, round_shape, solids_from_hand, solids_of_links
 from torchgrasp.app.report.viewer import (
@@ -21,6 +22,8 @@ from torchgrasp.app.report.viewer import (
     three,
 )
 from torchgrasp.foundation.errors import Status
+from torchgrasp.geometry.frames import real
+from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.hand.urdf import LinkShape
 from torchgrasp.ik.motion import APPROACH_DISTANCE
 from torchgrasp.values.closing import ClosingTrace
@@ -68,6 +71,32 @@ def test_buffers_hold_the_surface_the_cloud_and_the_contacts_of_the_run(run):
     assert (
         brightest.sum() > darkest.sum() + 100 and seen["surface"]["ramp"][-1] == brightest.tolist()
     )
+
+
+def test_an_upright_run_has_its_table_and_edge_in_its_own_frame(run):
+    motion = random_motion(2)
+    table = Plane.horizontal(-0.03).ending(real([0.01, 0.0, 0.0]), real([1.0, 0.5, 0.0]))
+    given = table.moved(motion)
+    grasps = move(run.grasps, motion)
+    there = dataclasses.replace(
+        run,
+        cloud=move(run.cloud, motion),
+        surface=move(run.surface, motion),
+        grasps=dataclasses.replace(grasps, meta=grasps.meta | {"table": given.describe()}),
+        spec=dataclasses.replace(run.spec, table=given),
+        mesh=None,
+        closure=None,
+    )
+    upright = there.upright()
+    room = table.clearance(run.surface.vertices)
+    for found in (upright.spec.plane, upright.grasps.table):
+        torch.testing.assert_close(
+            found.clearance(upright.surface.vertices), room, atol=1e-5, rtol=0
+        )
+    *normal, offset = describe(there)["edge"]
+    beyond = upright.surface.vertices @ real(normal) - offset
+    torch.testing.assert_close(beyond, table.edge.height(run.surface.vertices), atol=1e-5, rtol=0)
+    assert describe(run)["edge"] is None
 
 
 def test_the_hand_stands_where_the_stills_draw_it_and_approaches_along_its_path(run):

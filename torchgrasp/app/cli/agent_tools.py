@@ -56,7 +56,7 @@ from torchgrasp.foundation.errors import BadArgument, GraspError, Status
 from torchgrasp.foundation.rules import Fraction, Range, Seed
 from torchgrasp.geometry.frames import inverse, real
 from torchgrasp.geometry.mesh import read_mesh
-from torchgrasp.geometry.plane import Plane, as_plane, move, upright_frame
+from torchgrasp.geometry.plane import Plane, as_plane, move, upright_frame, upright_table
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.abilities import hand_abilities, random_joints
 from torchgrasp.hand.hand import Hand
@@ -916,7 +916,7 @@ class ShowGrasp(_GraspTool):
         surface = _read_surface(file)
         upright = inverse(upright_frame(surface.vertices, None, grasp.table))
         stood = move(grasp, upright)
-        table = None if grasp.table is None else 0.0
+        table = upright_table(grasp.table, inverse(upright))
         eye = rotated(facing(stood), self.turn)
         picture = draw_grasp(move(surface, upright), hand, stood, eye, table)
         what = "estimated surface" if self.mesh is None else "mesh"

@@ -3,8 +3,12 @@
 import dataclasses
 import datetime
 import functools
+import json
+import math
 from pathlib import Path
 from typing import Any, Literal
+
+import torch
 
 from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import (
@@ -26,6 +30,7 @@ from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.pose import find_plausible
 from torchgrasp.data.shipped import DATA, find_view, list_objects, load_object
+from torchgrasp.evaluation.drag_trial import lift_from_edge
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.export import save_surface
 from torchgrasp.export.play import stand
@@ -33,12 +38,17 @@ from torchgrasp.files import format_columns, format_line, sha256
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Count, Seed
+from torchgrasp.geometry.frames import rigid
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import read_mesh
-from torchgrasp.geometry.plane import as_plane
+from torchgrasp.geometry.plane import Plane, as_plane, move
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.clearing import order_to_clear
+from torchgrasp.planner.drag_plan import DragPlan
+from torchgrasp.planner.drag_text import KEY
+from torchgrasp.planner.edge import EdgePlan, plan_edge_grasps
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
@@ -63,6 +73,7 @@ STAGES = ("shape", "plan", "certify", "query", "refine")
 LEAST_BUDGET = 1e-3  # of --time-budget [s]
 ENOUGH = 0.9  # predicted success of an object that is easy enough: the others are not tried
 HELPS = 0.8  # share of the deviation that may remain after a second view that is worth telling
+DIGITS = 3  # decimals of a direction that is printed
 SHOWN = 5  # grasps that are printed
 OBJECT_WIDTHS = (-10, 7, -1)  # of the columns of a scene's objects
 
@@ -148,6 +159,15 @@ class Grasp(ForPrograms):
     resist: tuple[TaskName, ...] = option(
         (), "loads of --mass that the contacts must resist with the hand's strength"
     )
+    edge: tuple[float, ...] | None = option(
+        None,
+        "for low objects: X Y OX OY, a point on the edge of the table [m] and the direction away "
+        "from the table, in the frame of the cloud; six numbers X Y Z OX OY OZ where z is not up. "
+        "The hand presses on the object, drags it over the edge, and grasps it there",
+    )
+    table_friction: float = option(
+        0.3, "with --edge: coefficient of friction between object and table"
+    )
     no_report: bool = option(False, "write the grasps without the pages")
     rerun: bool = option(
         False, 'also write run.rrd, a recording of plan and closing (needs the extra "rerun")'
@@ -162,6 +182,7 @@ class Grasp(ForPrograms):
             import_rerun()
         scene = self.realsense or is_scene(path)
         self._check_choice(scene)
+        self._check_edge(scene)
         _ = self._task, self._friction  # refused before any work
         hand, among = inputs.load_fingers(self.hand, self.fingers)
         if self.realsense:
@@ -203,6 +224,21 @@ class Grasp(ForPrograms):
         elif self.time_budget is not None and not self.time_budget >= LEAST_BUDGET:
             raise BadArgument("--time-budget", self.time_budget, "at least 0.001 seconds")
 
+    def _check_edge(self, scene: bool) -> None:
+        """Raise `BadArgument` for --edge beside an option that the drag does not take."""
+        others = {
+            "a scene": scene,
+            "--mode": self.mode != "joint",
+            "--fingers auto": self.fingers == "auto",
+            "--promise": self.promise is not None,
+            "--resist": bool(self.resist),
+            "--keep": self.keep is not None,
+            "--avoid": self.avoid is not None,
+            "--time-budget": self.time_budget is not None,
+        }
+        for name in (name for name, given in others.items() if given and self.edge is not None):
+            raise BadArgument("--edge", f"{name} beside it", "one of the two")
+
     def _grasp_cloud(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
         """Plan on a point cloud and write the results; return the exit code."""
         mesh = self._true_mesh(path)
@@ -211,6 +247,8 @@ class Grasp(ForPrograms):
         view = self.view.with_table_of(file)
         cloud = file.cloud
         table = view.plane(file.cloud)
+        if self.edge is not None:
+            table = inputs.with_edge(table, self.edge)
         plane = as_plane(table)
         spec = (ContactSpec.paper if self.mode == "paper" else ContactSpec)(
             friction=self._friction, table=table
@@ -226,7 +264,11 @@ class Grasp(ForPrograms):
             elif plane is not None:
                 check_stand(true_mesh, plane, "--mesh")
         progress = StageProgress(
-            *["fingers"] * (among is not None), *STAGES, *["closing"] * self.close, "report"
+            *["fingers"] * (among is not None),
+            *STAGES,
+            *["drag"] * (self.edge is not None),
+            *["closing"] * self.close,
+            "report",
         )
         with progress.bar, inputs.holding("--out", out):
             origin = "no table" if table is None else inputs.describe_table(table)
@@ -236,22 +278,20 @@ class Grasp(ForPrograms):
             grasps, explanation = self._plan(cloud, hand, spec, among, progress)
             name = inputs.object_name(path if mesh is None else mesh)
             shape = progress.values["shape"]
+            edge = None
+            if self.edge is not None:
+                edge = self._plan_drag(cloud, hand, spec, grasps, progress)
+            drag = None if edge is None else edge.drag
+            if edge is not None and drag is not None:
+                grasps, shape = edge.grasps, edge.shape
+                progress.values["plan"] = None  # the contacts where the object stood
+                cloud = move(cloud, rigid(torch.eye(3), drag.displacement).to(cloud.points))
             run = self._gather(name, path, cloud, hand, spec, grasps, shape, progress, explanation)
-            surface = run.surface
             if self.close and true_mesh is not None and len(run.executable):
-                felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
-                trial = TrialSpec(friction=self._friction, mass=self._mass)
-                options = {"parts": parts, "table": plane, "surface": felt}
-                closure = close_hand(
-                    run.executable[0], run.hand, true_mesh, trial, seed=self.seed, **options
-                )
-                progress.end(
-                    "closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}"
-                )
-                run = dataclasses.replace(
-                    run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure
-                )
+                run = self._close(run, edge, true_mesh, parts, plane, progress)
             progress.end("report", self._write(out, run))
+        if drag is not None:
+            print(f"\ndrag first  {describe_drag(drag, run.hand)}")
         executable = print_grasps(run)
         answer(describe_run(run, out))
         return (
@@ -267,15 +307,81 @@ class Grasp(ForPrograms):
         progress: StageProgress,
     ) -> tuple[Grasps, Explanation | None]:
         """Return the grasps of a cloud or of a scene's target; if none is executable, also what
-        would help.
+        would help, but not with --edge.
         """
         given = (source, hand, spec, self.starts, self.seed)
         options: dict[str, Any] = {"fingers": among, "mode": self.mode, "observer": progress.end}
         options |= self._task
         grasps = plan_grasps(*given, **options, time_budget=self.time_budget or None)
-        if bool((grasps.status == Status.OK).any()):
+        if self.edge is not None or bool((grasps.status == Status.OK).any()):
             return grasps, None
         return grasps, explain_empty(*given, **options)
+
+    def _plan_drag(
+        self,
+        cloud: PointCloud,
+        hand: Hand,
+        spec: ContactSpec,
+        stands: Grasps,
+        progress: StageProgress,
+    ) -> EdgePlan | None:
+        """Return a drag to the table's edge with grasps there; None if there is none, or if the
+        grasps where the object `stands` are as likely to hold.
+        """
+        plan = plan_edge_grasps(
+            cloud,
+            hand,
+            spec,
+            self.starts,
+            self.seed,
+            task=GraspTask(self._mass),
+            table_friction=self.table_friction,
+        )
+        if plan.drag is None:
+            progress.end("drag", f"none: {plan.reason}")
+            return None
+        sure = 0.0 if math.isnan(plan.success) else plan.success
+        found = f"{describe_best(stands)} where it stands, {describe_best(plan.grasps)} at the edge"
+        found += f", {sure:.0%} with the drag"
+        better = rank_best(plan.grasps) >= 0 and sure > rank_best(stands)
+        progress.end("drag", f"{found}: {'dragged to the edge' if better else 'it stays'}")
+        return plan if better else None
+
+    def _close(
+        self,
+        run: Run,
+        edge: EdgePlan | None,
+        mesh: "trimesh.Trimesh",
+        parts: "list[trimesh.Trimesh] | None",
+        table: Plane | None,
+        progress: StageProgress,
+    ) -> Run:
+        """Return the run with the closing of its best grasp on the true mesh, after the drag if
+        there is one.
+        """
+        friction = None if self.edge is None else self.table_friction
+        trial = TrialSpec(friction=self._friction, mass=self._mass, table_friction=friction)
+        options = {"parts": parts, "table": table}
+        if edge is None:
+            surface = run.surface
+            felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
+            closure = close_hand(
+                run.executable[0], run.hand, mesh, trial, seed=self.seed, surface=felt, **options
+            )
+        else:
+            lift = lift_from_edge(edge, run.hand, mesh, trial, self.seed, **options)
+            if not lift.tries:
+                assert lift.drag is not None
+                progress.end("closing", f"the drag failed: {lift.drag.status.sentence}")
+                return dataclasses.replace(run, stages=tuple(progress.stages))
+            if lift.drag is not None:
+                mesh = mesh.copy().apply_transform(lift.drag.motion.numpy())
+            closure = lift.tries[-1].result
+        progress.end(
+            "closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}"
+        )
+        stages = tuple(progress.stages)
+        return dataclasses.replace(run, stages=stages, mesh=mesh, closure=closure)
 
     def _gather(
         self,
@@ -516,6 +622,36 @@ def print_grasps(run: Run) -> bool:
     return len(run.executable) > 0
 
 
+def rank_best(grasps: Grasps) -> float:
+    """Return the predicted success of the best executable grasp: 0 if it is unknown, -1 if there
+    is none.
+    """
+    best = grasps[grasps.status == Status.OK][:1]
+    return max(0.0, *best.success.nan_to_num().tolist()) if len(best) else -1.0
+
+
+def describe_best(grasps: Grasps) -> str:
+    """Return a text that says how likely the best executable grasp is to hold."""
+    best = grasps[grasps.status == Status.OK][:1]
+    return f"success {format_success(best)}" if len(best) else "no grasp"
+
+
+def describe_drag(drag: DragPlan, hand: Hand) -> str:
+    """Return a sentence that says what the hand does in a drag."""
+    pressing = [
+        name
+        for name, pressed in zip(hand.tips.names, drag.presses.tolist(), strict=True)
+        if pressed
+    ]
+    length = float(norm(drag.displacement))
+    along = ", ".join(f"{0.0 + round(x, DIGITS):g}" for x in (drag.displacement / length).tolist())
+    fingers = " and ".join(pressing)
+    return (
+        f"{fingers} press on the object from above with {drag.force:.1f} N, "
+        f"and drag it {1e3 * length:.0f} mm along ({along})"
+    )
+
+
 def find_look(shape: ShapeGP, grasps: Grasps, spec: ContactSpec) -> NextView | None:
     """Return from where a second view would help.
 
@@ -551,6 +687,7 @@ def describe_run(run: Run, out: Path) -> dict[str, Any]:
         "held": None if run.closure is None else run.closure.held,
         "verdict": verdict(run),
         "best": best,
+        "drag": json.loads(run.grasps.meta.get(KEY, "null")),
         "look_next": None if run.look is None else describe_look(run.look),
         "file": str(out / "grasps.safetensors"),
     }

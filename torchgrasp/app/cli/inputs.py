@@ -37,6 +37,7 @@ from torchgrasp.values.specs import Simulator
 
 WIDEST = 1.5  # tangent of half an angle of view wider than that of depth cameras
 MOST_UNSEEN = 0.01  # share of the points outside: more, and the cloud is in another frame
+LEVEL = 0.9  # least upward part of a table's unit normal where x and y say where its edge is
 MOST_POINTS = 100_000  # most points of a file that are used; a shape is fitted to fewer
 CLOUD_HELP = "point cloud of one object (.ply, .pcd, .npy, .npz, or text as .xyz, .csv, .pts)"
 OUT_CLOUD_HELP = "point cloud to write (.npz or .ply), in metres"
@@ -218,6 +219,34 @@ def read_table(table: tuple[float, ...]) -> Plane | float:
     if not bool(length > 0):
         raise BadArgument("--table", "a normal of length zero", "the direction that points up")
     return Plane(numbers[:3] / length, float(numbers[3] / length))
+
+
+def with_edge(table: Plane | float | None, edge: tuple[float, ...]) -> Plane:
+    """Return a table, a plane or a height z [m], that ends at the edge of --edge.
+
+    `edge` holds a point on the edge [m] and the direction away from the table, each by x and y, or
+    by x, y and z.
+    """
+    plane = as_plane(table)
+    if plane is None:
+        raise BadArgument("--edge", "--no-table beside it", "one of the two")
+    if len(edge) not in (4, 6):
+        wanted = "X Y OX OY, a point on the edge and the direction away from the table"
+        raise BadArgument("--edge", f"{len(edge)} numbers", wanted)
+    numbers = check_tensor("--edge", real(edge), (len(edge),))
+    point, outward = numbers.chunk(2)
+    if not bool(outward.any()):
+        wanted = "the direction away from the table"
+        raise BadArgument("--edge", "a direction of length zero", wanted)
+    if len(edge) == 4:
+        normal = plane.normal.double()
+        if not float(normal[2]) > LEVEL:
+            raise BadArgument("--edge", "four numbers where z is not up", "six: X Y Z OX OY OZ")
+        z = (plane.offset - normal[:2] @ point) / normal[2]
+        point = torch.cat([point, z[None]])
+        outward = torch.cat([outward, real([0.0])])
+    with naming(outward="--edge"):
+        return plane.ending(point, outward)
 
 
 def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from torchgrasp.foundation.lazy import Image, ImageDraw, ImageFont, matplotlib, trimesh
+from torchgrasp.geometry.plane import Plane, as_plane
 
 Points = Float[np.ndarray, "n 3"]  # points [m], or colours in [0, 1]
 Color = tuple[float, float, float]  # red, green and blue in [0, 1]
@@ -237,26 +238,30 @@ class Canvas:
     def add_table(
         self,
         corners: Points,
-        height: float | None,
+        table: Plane | float | None,
         shadows: Sequence[tuple[np.ndarray, np.ndarray]] = (),
     ) -> None:
-        """Add an unshaded round table top at `height` z [m]; without a height nothing is added.
+        """Add an unshaded round table top; without a table nothing is added.
 
-        Its centre is that of `corners` (n, 3) [m] in x and y. The `shadows` are meshes, by vertices
-        (v, 3) [m] and faces (t, 3), whose outlines darken the table straight below them.
+        The `table` is level: its height z [m], or a plane. It is cut off at its edge. Its centre is
+        that of `corners` (n, 3) [m] in x and y. The `shadows` are meshes, by vertices (v, 3) [m]
+        and faces (t, 3), whose outlines darken the table straight below them.
         """
-        if height is None:
+        plane = as_plane(table)
+        if plane is None:
             return
+        height = plane.offset
         across = corners[:, :2]
         radius = MARKS.table_radius * float(np.linalg.norm(np.ptp(across, axis=0)))
         top = trimesh.creation.cylinder(
             radius + MARKS.table_rim, MARKS.table_thickness, sections=MARKS.table_sections
         )
         center = np.append((across.min(0) + across.max(0)) / 2, height - MARKS.table_depth)
-        self.add_mesh(top.vertices + center, top.faces, TABLE, lit=False)
+        vertices, faces = _cut_off(top.vertices + center, top.faces, plane.edge)
+        self.add_mesh(vertices, faces, TABLE, lit=False)
         for vertices, faces in shadows:
             level = np.full(len(vertices), height - MARKS.shadow_depth)
-            flat = np.column_stack([vertices[:, :2], level])
+            flat, faces = _cut_off(np.column_stack([vertices[:, :2], level]), faces, plane.edge)
             up = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
             self.add_mesh(flat, faces, SHADOW, up, lit=False)
 
@@ -312,6 +317,18 @@ def frame_camera(
     distance = half[2] + FRAMING.margin * (max(high, wide) / tangent)
     center = middle @ frame - frame[1] * drop * distance * tangent
     return Camera(center + back * distance, frame, float(np.deg2rad(FRAMING.angle)))
+
+
+def _cut_off(
+    vertices: Points, faces: np.ndarray, edge: Plane | None
+) -> tuple[Float[np.ndarray, "v 3"], np.ndarray]:
+    """Return vertices (v, 3) [m] and faces (t, 3) of the part of a mesh that is behind an edge."""
+    if edge is None:
+        return vertices, faces
+    inward = -np.array(edge.normal.tolist())
+    on = -edge.offset * inward
+    kept, left, *_ = trimesh.intersections.slice_faces_plane(vertices, faces, inward, on)
+    return kept, left
 
 
 def sharp_normals(

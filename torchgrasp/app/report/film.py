@@ -18,6 +18,7 @@ from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import apply, real
 from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosureResult
 
@@ -80,13 +81,18 @@ MOTION_COLORS = {
 
 
 def draw_film(
-    mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direction: Direction
+    mesh: "trimesh.Trimesh",
+    hand: Hand,
+    closure: ClosureResult,
+    direction: Direction,
+    edge: Plane | None = None,
 ) -> bytes:
     """Return a PNG of a simulated closing: pictures of its main moments in a row, over plots
     against time.
 
     `closure` holds the record that is plotted. `mesh` is the true object [m] in the frame of the
     grasp, where z is up. The unit vector `direction` points from the object to the camera.
+    The table ends at an `edge`; None means that it does not end.
     """
     from matplotlib.figure import Figure
 
@@ -98,7 +104,7 @@ def draw_film(
     height = FILM.still + sum(heights) + FILM.plot_gap * len(plots) + FILM.bottom
     size = FILM.width / FILM.dpi, height / FILM.dpi
     figure = Figure(size, dpi=FILM.dpi, facecolor=paint.PAPER)
-    stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction)
+    stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction, edge)
     font = FILM.font if count < FILM.many else FILM.small_font
     bottom = 1 - FILM.still / height
     shown = (FILM.still - FILM.title) / height
@@ -169,6 +175,7 @@ def _draw_stills(
     closure: ClosureResult,
     ticks: list[int],
     direction: Direction,
+    edge: Plane | None,
 ) -> list[np.ndarray]:
     """Return pictures of the hand and the object at the given ticks, all at the same scale."""
     known = closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1)
@@ -182,7 +189,8 @@ def _draw_stills(
         solids_from_hand(hand, closure.joints[t], closure.joint_names, closure.hand_pose[t])
         for t in at
     ]
-    table = float(apply(closure.object_pose[0].double(), vertices)[:, 2].min())
+    height = float(apply(closure.object_pose[0].double(), vertices)[:, 2].min())
+    table = dataclasses.replace(Plane.horizontal(height), edge=edge)
     near = [x for x in places if np.abs(x - places[0]).mean(0).max() < FILM.far]
     seen = np.concatenate([*near, *(s.vertices for solids in hands for s in solids)])
     size = FILM.width // len(ticks), FILM.still - FILM.title

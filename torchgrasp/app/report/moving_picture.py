@@ -26,7 +26,7 @@ from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError
 from torchgrasp.foundation.lazy import Image, trimesh
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import apply, inverse, real, rotate
-from torchgrasp.geometry.plane import move, upright_frame
+from torchgrasp.geometry.plane import as_plane, move, upright_frame, upright_table
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.planning import Grasps
@@ -180,7 +180,9 @@ def _draw(
             pose = turned[k, solid.link]
             corners.append(solid.vertices @ pose[:3, :3].T + pose[:3, 3])
     seen = np.concatenate(corners)
-    height = None if grasp.table is None else float(places[0][:, 2].min())
+    table = as_plane(upright_table(grasp.table, inverse(level)))
+    if table is not None:  # under the true object
+        table = dataclasses.replace(table, offset=float(places[0][:, 2].min()))
     camera = paint.frame_camera(seen, where, size=MOVIE.size)
     for place, bend, frames in zip(places, bends, turned, strict=True):
         canvas = paint.Canvas()
@@ -190,7 +192,7 @@ def _draw(
             corner = solid.vertices @ turn + frames[solid.link, :3, 3]
             moved.append(solid._replace(vertices=corner, normals=solid.normals @ turn))
         shadows = [(place, faces), *((s.vertices, s.faces) for s in moved)]
-        canvas.add_table(seen, height, shadows)
+        canvas.add_table(seen, table, shadows)
         canvas.add_mesh(place, faces, paint.OBJECT, bend)
         add_solids(canvas, moved)
         yield canvas.render(camera, MOVIE.size)

@@ -13,7 +13,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import GraspError, Status
 from torchgrasp.foundation.lazy import Image
 from torchgrasp.geometry.frames import inverse
-from torchgrasp.geometry.plane import move, upright_frame
+from torchgrasp.geometry.plane import move, upright_frame, upright_table
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.shape.fit import fit_shape
@@ -110,8 +110,8 @@ def _draw(grasp: Grasps, cloud: PointCloud | None, hand: Hand) -> bytes:
         upright_from_obj = inverse(upright_frame(points, viewpoint, table))
         grasp = move(grasp, upright_from_obj)
         surface = None if surface is None else move(surface, upright_from_obj)
-    height = None if table is None else 0.0
-    return stills.draw_grasp(surface, hand, grasp, stills.facing(grasp), height)
+        table = upright_table(table, inverse(upright_from_obj))
+    return stills.draw_grasp(surface, hand, grasp, stills.facing(grasp), table)
 
 
 def _shrink(png: bytes) -> bytes:

@@ -63,7 +63,7 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
 def draw_pictures(run: Run) -> Sections:
     """Return all pictures of a run: pairs of caption and PNG by the title of their section."""
     run = run.upright()
-    table = None if run.spec.table is None else 0.0
+    table = run.spec.plane
     view = stills.view_of(run.cloud)
     best = run.executable
     behind = stills.rotated(view, 180.0)
@@ -97,7 +97,7 @@ def draw_pictures(run: Run) -> Sections:
             ("The same from another side.", aside),
         ]
     if run.closure is not None and run.mesh is not None:
-        film = draw_film(run.mesh, run.hand, run.closure, film_side)
+        film = draw_film(run.mesh, run.hand, run.closure, film_side, table and table.edge)
         caption = describe_film(run.mesh, run.hand, run.closure)
         sections["Closing on the true object"] = [(caption, film)]
     return sections

@@ -21,7 +21,7 @@ from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import apply, inverse, real
 from torchgrasp.geometry.linalg import norm
-from torchgrasp.geometry.plane import move, upright_frame
+from torchgrasp.geometry.plane import move, upright_frame, upright_table
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.explain import Explanation
 from torchgrasp.scene.scene import Scene
@@ -103,8 +103,7 @@ class Run:
         """Return the run in a frame whose z axis points up.
 
         z is the normal of the table in `spec`, and the table has the height z = 0. Without a table,
-        z points to the camera. Without both, it points where the points spread least. `spec` is not
-        transformed: its table stays in the frame of the old cloud.
+        z points to the camera. Without both, it points where the points spread least.
 
         Raises `BadArgument` if the executable grasps do not touch the mesh. It is also raised if
         the table is above most points of the cloud.
@@ -120,11 +119,18 @@ class Run:
             object_pose = upright_from_obj @ closure.object_pose.double() @ obj_from_upright
             hand_pose = upright_from_obj @ closure.hand_pose.double()
             closure = dataclasses.replace(closure, object_pose=object_pose, hand_pose=hand_pose)
+        table = upright_table(self.spec.plane, obj_from_upright)
+        grasps = move(self.grasps, upright_from_obj)
+        known = self.grasps.table
+        if known is not None:
+            meta = grasps.meta | {"table": known.moved(upright_from_obj).describe()}
+            grasps = dataclasses.replace(grasps, meta=meta)
         return dataclasses.replace(
             self,
+            spec=dataclasses.replace(self.spec, table=table),
             cloud=move(self.cloud, upright_from_obj),
             surface=move(self.surface, upright_from_obj),
-            grasps=move(self.grasps, upright_from_obj),
+            grasps=grasps,
             mesh=mesh,
             closure=closure,
             scene=None if self.scene is None else self.scene.to_upright(obj_from_upright),

@@ -18,6 +18,7 @@ from torchgrasp.app.report.solids import PARKED, Solid, finger_of_links, solids_
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import Image
 from torchgrasp.geometry.linalg import dot, norm, unit
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
@@ -62,10 +63,10 @@ APART = 10.0  # facing pads that is worth 0.1 m less between the tips and their 
 FREE = 10.0  # a posture without collision is better than any with one
 
 
-def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
+def draw_cloud(cloud: PointCloud, table: Plane | float | None = None) -> bytes:
     """Return a PNG of a cloud as its camera sees it, coloured by height.
 
-    `table` is the height z of the table [m]; None means no table.
+    `table` is the level table, or its height z [m]; None means no table.
     """
     points = _thinned(to_array(cloud.points), STILLS.most_points)
     height = points[:, 2] - points[:, 2].min()
@@ -76,10 +77,12 @@ def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
     return canvas.render_png(points, view_of(cloud))
 
 
-def draw_surface(surface: Surface, direction: Direction, table: float | None = None) -> bytes:
+def draw_surface(
+    surface: Surface, direction: Direction, table: Plane | float | None = None
+) -> bytes:
     """Return a PNG of the estimated surface, coloured by its standard deviation [mm].
 
-    `direction` points to the camera. `table` is the height z of the table [m]; None means no table.
+    `direction` points to the camera. `table` is the level table, or its height z [m]; None means no table.
     """
     vertices, faces, normals = mesh_arrays(surface)
     colors, most = paint.color_std(to_array(surface.std_m))
@@ -91,11 +94,11 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
 
 
 def draw_contacts(
-    surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None
+    surface: Surface, contacts: Contacts, direction: Direction, table: Plane | float | None = None
 ) -> bytes:
     """Return a PNG of the contacts of the first grasp, with normals, on the estimated surface.
 
-    `direction` points to the camera. `table` is the height z of the table [m]; None means no table.
+    `direction` points to the camera. `table` is the level table, or its height z [m]; None means no table.
     """
     canvas = paint.Canvas()
     vertices = _add_object(canvas, surface, transparent=True)
@@ -109,12 +112,12 @@ def draw_grasp(
     hand: Hand,
     grasp: Grasps,
     direction: Direction,
-    table: float | None = None,
+    table: Plane | float | None = None,
 ) -> bytes:
     """Return a PNG of the hand of the first grasp on the estimated surface, with its contacts.
 
     Without a `surface` only hand and contacts are shown. `direction` points to the camera. `table`
-    is the height z of the table [m]; None means no table.
+    is the level table, or its height z [m]; None means no table.
     """
     canvas, corners = _grasp(surface, hand, grasp)
     canvas.add_table(corners, table)

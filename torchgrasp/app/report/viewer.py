@@ -37,7 +37,7 @@ from torchgrasp.data.accept import CloudLike, HandLike, as_cloud
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.geometry.plane import upright_frame
+from torchgrasp.geometry.plane import Plane, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
@@ -202,6 +202,7 @@ def describe(run: Run) -> dict[str, Any]:
         "frame": frame.tolist(),
         "sensors": [place.tolist() for place in viewpoints if place is not None],
         "table": None if run.spec.table is None else TABLE,
+        "edge": _edge(run.spec.plane),
         "object": OBJECT,
         "fingers": [list(pair) for pair in zip(run.hand.tips.names, FINGERS, strict=False)],
         "cloud": _points(run.cloud.points),
@@ -272,6 +273,12 @@ def pose_postures(hand: Hand, grasps: Grasps) -> Float[Tensor, "g p l 4 4"]:
     motion = [(opened, away), (opened, raised), (grasps.joints.double(), pose), (squeezed, pose)]
     poses = [link_poses(hand, hand.expand_joints(q), hand.tree.joint_names, p) for q, p in motion]
     return torch.stack(poses, 1)
+
+
+def _edge(table: Plane | None) -> list[float] | None:
+    """Return normal and offset [m] of a table's edge; None without one."""
+    edge = None if table is None else table.edge
+    return None if edge is None else [*edge.normal.tolist(), edge.offset]
 
 
 def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:

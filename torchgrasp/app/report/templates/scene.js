@@ -197,15 +197,17 @@ const sphere = bounds.getBoundingSphere(new THREE.Sphere());
 const middle = surface.boundingBox.getCenter(new THREE.Vector3());
 if (run.table) {
   const radius = 1.3 * sphere.radius, CELL = 0.05; // [m]
+  const behind = run.edge ? [new THREE.Plane(new THREE.Vector3(...run.edge.slice(0, 3)).negate(), run.edge[3])] : [];
   const disc = new THREE.CircleGeometry(radius, 96), grid = [];
-  const top = new THREE.Mesh(disc, new THREE.MeshBasicMaterial({ color: run.table, side: THREE.DoubleSide }));
-  const shade = new THREE.Mesh(disc, new THREE.ShadowMaterial({ opacity: 0.25 }));
+  const top = new THREE.Mesh(disc, new THREE.MeshBasicMaterial({ color: run.table, side: THREE.DoubleSide, clippingPlanes: behind }));
+  const shade = new THREE.Mesh(disc, new THREE.ShadowMaterial({ opacity: 0.25, clippingPlanes: behind }));
   shade.receiveShadow = true;
   for (let k = -Math.floor(radius / CELL); k <= radius / CELL; k++) {
     const half = Math.sqrt(radius ** 2 - (k * CELL) ** 2);
     grid.push(...[[k * CELL, -half], [k * CELL, half], [-half, k * CELL], [half, k * CELL]].map((p) => new THREE.Vector3(...p, 0)));
   }
   const net = lines(grid, "#d3d0c6");
+  net.material.clippingPlanes = behind;
   // A hair apart, so that none of them flickers through another.
   [top, net, shade].forEach((part, k) => part.position.set(middle.x, middle.y, -0.0015 + 0.0005 * k));
   layer("table").add(top, net, shade);

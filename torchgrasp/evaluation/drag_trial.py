@@ -1,0 +1,382 @@
+"""Simulated drags: a hand drags the true object to the edge of its table, then lifts it there."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.cloud.agreement import AGREEMENT, check_contacts, check_stand
+from torchgrasp.control.drag import DRAGGING, DragController
+from torchgrasp.control.finger_forces import drive_stiffness, stiff_drives
+from torchgrasp.control.reference import ClosingReference
+from torchgrasp.data.shipped import GraspObject
+from torchgrasp.evaluation.frame import moved_mesh, rounded, world_frame
+from torchgrasp.evaluation.protocols import draw_trial
+from torchgrasp.evaluation.several_tries import LiftTry, lift_grasps
+from torchgrasp.evaluation.trial import TRIALS, GraspTrial, Truth
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import ANY, Count, Measured, Seed
+from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.hand.hand import Hand
+from torchgrasp.planner.drag_plan import DragPlan
+from torchgrasp.planner.edge import EdgePlan
+from torchgrasp.shape.surface import surface_field
+from torchgrasp.sim.convex_parts import read_solid
+from torchgrasp.sim.scene_spec import SceneSpec, edge_of
+from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
+from torchgrasp.values.closing import ClosingGains, SensorModel
+from torchgrasp.values.distribution import Distribution
+from torchgrasp.values.specs import TrialSpec
+
+
+@dataclasses.dataclass(frozen=True)
+class DragTrialNumbers:
+    """Parameters of a simulated drag and of its verdict."""
+
+    rest: float = 0.5
+    """Time [s] after the drag in which the object comes to rest."""
+    below: float = 0.005
+    """Depth [m] of the object's lowest point below the table from which it falls over the edge."""
+    tipped: float = math.radians(10)
+    """Turn [rad] of the object's vertical from which it has toppled."""
+    slipped: float = 0.02
+    """Distance [m] from the planned place beyond which the tips slid over the object."""
+    table_friction: float = 0.3
+    """Coefficient of friction between object and table by default: that of `plan_edge_grasps`."""
+    decimals: int = 9
+    """Decimals to which offsets [m] of the table and its edge are rounded."""
+
+
+TRIAL = DragTrialNumbers()
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class DragResult(Value):
+    """The record of a simulated drag.
+
+    Attributes:
+        status: `OK`; `NO_CONTACT` if the hand could not press, or lost the object on the way;
+            `DROPPED` if the object toppled, or hangs or fell over the edge; `SLIPPED` if it is
+            more than 20 mm (`TRIAL.slipped`) from where the plan wanted it; `START_OVERLAP` or
+            `UNSTABLE` as in `close_hand`.
+        motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform; NaN if
+            the drag is `UNSTABLE`.
+        missed: distance [m] of the object's centre of mass from where the plan wanted it; NaN in
+            the same case.
+        forces: sum (t,) [N] of the true normal forces of the fingertips at each control tick.
+    """
+
+    status: Status
+    motion: Annotated[Float[Tensor, "4 4"], ANY]
+    missed: Measured
+    forces: Annotated[Float[Tensor, "t"], ANY]
+
+
+@checked
+@single_threaded
+def drag_object(
+    plan: DragPlan,
+    hand: Hand,
+    mesh: "trimesh.Trimesh | Path | str | GraspObject",
+    spec: TrialSpec | None = None,
+    seed: Seed = 0,
+    *,
+    parts: "Sequence[trimesh.Trimesh] | None" = None,
+    table: Plane | None = None,
+) -> DragResult:
+    """Drag the true object as planned, in simulation; return where it came to rest.
+
+    Args:
+        plan: the drag, from `plan_edge_grasps`.
+        hand: the hand of the plan.
+        mesh: the true object [m], closed, in the frame of the plan: a trimesh, a file, or a
+            `GraspObject`.
+        spec: parameters of the trial. None means a table with a friction of 0.3, as planned by
+            default: `TrialSpec(table_friction=0.3)`. The closing is not used.
+        seed: seed of the sensors' noise, and of friction and mass if the `spec` has distributions
+            of them.
+        parts: convex parts [m] of the mesh. None means those of a `GraspObject`, or those that
+            `convex_parts` computes.
+        table: the true table, with its edge. None means that of the plan.
+
+    Raises:
+        BadArgument: a plan that `DragController` refuses, or a mesh that does not stand on the
+            table.
+        BadArgument: a sensor that measures no force, at all or at a finger that presses.
+        MeshError: the mesh is missing, open or without volume.
+        MissingExtra: the simulator is not installed.
+
+    >>> import torch
+    >>> from torchgrasp import ContactSpec, Plane, load_hand, plan_edge_grasps
+    >>> from torchgrasp.cloud import look_at, partial_view
+    >>> box = trimesh.creation.box([0.12, 0.06, 0.01]).apply_translation([0.0, 0.0, 0.005])
+    >>> view, hand = partial_view(box, look_at(-135.0, 40.0, target=box)), load_hand("barrett")
+    >>> x = torch.tensor([1.0, 0, 0])
+    >>> spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.15 * x, x))
+    >>> plan = plan_edge_grasps(view, hand, spec, starts=2)
+    >>> drag_object(plan.drag, hand, box, TrialSpec(table_friction=0.3), parts=[box]).status
+    <Status.OK: 0>
+    """
+    if isinstance(mesh, GraspObject):
+        parts = mesh.parts if parts is None else parts
+        mesh = mesh.mesh
+    solid = read_mesh(mesh)
+    table = plan.table if table is None else table
+    check_stand(solid, table)
+    spec = draw_trial(_choose(spec), seed)
+    _check_sensor(spec.sensor, plan, hand)
+    return _Drag(plan, hand.to("cpu", torch.float64), solid, parts, table, spec, seed).complete()
+
+
+def _check_sensor(sensor: SensorModel, plan: DragPlan, hand: Hand) -> None:
+    """Raise `BadArgument` if a pressing finger has no sensor of forces."""
+    if sensor.kind == "binary":
+        raise BadArgument("spec.sensor", "'binary' sensors", "sensors that measure forces")
+    names = [name for name, on in zip(hand.finger_names, plan.presses.tolist(), strict=False) if on]
+    dead = [name for name in names if name in sensor.dead]
+    if dead:
+        raise BadArgument("spec.sensor", f"dead fingers {dead}", "forces of the fingers that press")
+
+
+class EdgeLift(NamedTuple):
+    """The record of a drag and of the lift after it; `lift_from_edge` returns it.
+
+    Attributes:
+        drag: record of the drag; None if the plan has none.
+        tries: the tries of the lift (`lift_grasps`). Empty if the drag failed, or left the object so
+            far off that most contacts of the grasps are not on it.
+    """
+
+    drag: DragResult | None
+    tries: tuple[LiftTry, ...]
+
+    @property
+    def held(self) -> bool:
+        """Whether the last try held the object."""
+        return bool(self.tries) and self.tries[-1].result.held
+
+
+@checked
+@single_threaded
+def lift_from_edge(
+    plan: EdgePlan,
+    hand: Hand,
+    mesh: "trimesh.Trimesh | Path | str | GraspObject",
+    spec: TrialSpec | None = None,
+    seed: Seed = 0,
+    *,
+    tries: Count = 1,
+    parts: "Sequence[trimesh.Trimesh] | None" = None,
+    table: Plane | None = None,
+) -> EdgeLift:
+    """Drag the true object to the edge, then lift it with the plan's grasps, the first one first.
+
+    The grasps are where the plan expects the object, and the object is where the drag left it.
+
+    Args:
+        plan: drag and grasps, from `plan_edge_grasps`, with at least one executable grasp.
+        hand: the hand of the plan.
+        mesh: the true object [m], as for `drag_object`.
+        spec: parameters of both trials; None means the default of `drag_object`.
+        seed: seed of both trials.
+        tries: largest number of grasps that are tried (`lift_grasps`).
+        parts: convex parts [m] of the mesh, as for `drag_object`.
+        table: the true table, with its edge. None means that of the plan.
+
+    Raises the errors of `drag_object` and `lift_grasps`, and `BadArgument` for a plan without an
+    executable grasp.
+
+    >>> import torch
+    >>> from torchgrasp import ContactSpec, Plane, load_hand, plan_edge_grasps
+    >>> from torchgrasp.cloud import look_at, partial_view
+    >>> box = trimesh.creation.box([0.12, 0.06, 0.01]).apply_translation([0.0, 0.0, 0.005])
+    >>> view, hand = partial_view(box, look_at(-135.0, 40.0, target=box)), load_hand("barrett")
+    >>> x = torch.tensor([1.0, 0, 0])
+    >>> spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.15 * x, x))
+    >>> plan = plan_edge_grasps(view, hand, spec, starts=8)
+    >>> trial = TrialSpec(table_friction=0.3, hold_time=0.2)
+    >>> lift_from_edge(plan, hand, box, trial, parts=[box]).held
+    True
+    """
+    good = plan.grasps[plan.grasps.status == Status.OK]
+    if not len(good):
+        raise BadArgument("plan", "no executable grasp", "at least one")
+    if isinstance(mesh, GraspObject):
+        parts = mesh.parts if parts is None else parts
+        mesh = mesh.mesh
+    solid, pieces = read_solid(read_mesh(mesh), parts)
+    table = good.table if table is None else table
+    drag = None
+    if plan.drag is not None:
+        drag = drag_object(plan.drag, hand, solid, spec, seed, parts=pieces, table=table)
+        if drag.status is not Status.OK:
+            return EdgeLift(drag, ())
+        motion = drag.motion.numpy()
+        solid, *pieces = (x.copy().apply_transform(motion) for x in (solid, *pieces))
+        try:
+            check_contacts(good, solid, TRIALS.slack, AGREEMENT.astray)
+        except BadArgument:  # the drag is to blame, not the caller
+            return EdgeLift(drag, ())
+    truth = Truth(solid, pieces, table=table)
+    trial = GraspTrial(hand, good, truth, seed, surface=surface_field(plan.shape))
+    return EdgeLift(drag, lift_grasps(trial, _choose(spec), tries))
+
+
+def _choose(spec: TrialSpec | None) -> TrialSpec:
+    """Return the parameters of a trial; by default the table has the friction that plans expect."""
+    return TrialSpec(table_friction=TRIAL.table_friction) if spec is None else spec
+
+
+class _Drag:
+    """One simulated drag."""
+
+    def __init__(
+        self,
+        plan: DragPlan,
+        hand: Hand,
+        mesh: "trimesh.Trimesh",
+        parts: "Sequence[trimesh.Trimesh] | None",
+        table: Plane,
+        spec: TrialSpec,
+        seed: int,
+    ) -> None:
+        self.obj_from_world = world_frame(table, plan.obj_from_hand.to("cpu", torch.float64))
+        plan = _in_world(plan, inverse(self.obj_from_world))
+        self.plan = plan
+        self.spec = spec
+        mesh, parts = read_solid(mesh, parts)
+        density = spec.density
+        mass = Distribution.of(spec.mass).mean if density is None else density * float(mesh.volume)
+        solid, *pieces = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
+        self.controller = DragController(plan, hand)
+        start = plan.obj_from_hand[:3, :3] @ self.controller.targets.palm
+        joints = {name: float(q) for name, q in hand.expand(plan.joints).items()}
+        scene_spec = SceneSpec(
+            urdf_path=hand.urdf_path,
+            world_from_hand=plan.obj_from_hand.numpy(),
+            joints=joints,
+            drives=stiff_drives(hand, spec.kp),
+            tip_links=tuple(hand.tips.links),
+            mesh=solid,
+            parts=pieces,
+            mass=mass,
+            friction=Distribution.of(spec.friction).mean,
+            table_friction=spec.table_friction,
+            gravity=spec.gravity,
+            timestep=spec.timestep,
+            patch=spec.patch,
+            height=0.0,
+            edge=self._edge(table),
+            self_pairs=hand.self_pairs if spec.self_collision else (),
+            yields=float(norm(plan.displacement))
+            + float(norm(start))
+            + DRAGGING.lag
+            + DRAGGING.deepest,
+            start=tuple(start.tolist()),
+        )
+        self.vertices = np.asarray(solid.vertices)
+        self.scene = open_scene(scene_spec, spec.simulator)
+        generator = torch.Generator().manual_seed(seed) if spec.noise else None
+        self.robot = SimulatedHand(
+            self.scene, _reference(hand, plan, spec), spec.control_rate, generator
+        )
+        self.overlap = self.scene.penetration()
+
+    def _edge(self, table: Plane) -> tuple[float, float, float] | None:
+        """Return the table's edge in the simulator's frame."""
+        return edge_of(_rounded_table(table.moved(inverse(self.obj_from_world))))
+
+    def complete(self) -> DragResult:
+        """Run the drag; return its record."""
+        forces = list[float]()
+        start = self.scene.object_pose()
+        if self.overlap > self.spec.overlap:
+            return self._result(Status.START_OVERLAP, start, forces)
+        observation = self.robot.tick(self.controller.targets)
+        while self.controller.phase != "done":  # the controller ends every phase
+            targets = self.controller.step(observation, self.robot.period)
+            observation = self.robot.tick(targets)
+            forces.append(float(self.robot.force.sum()))
+        self.robot.rest(self.robot.ticks(TRIAL.rest))
+        return self._result(self.controller.status, start, forces)
+
+    def _result(self, status: Status, start: np.ndarray, forces: list[float]) -> DragResult:
+        """Return the record of a drag; its status tells whether the object fell."""
+        pose = self.scene.object_pose()
+        moved = torch.from_numpy(pose @ np.linalg.inv(start))
+        centre = torch.from_numpy(self.scene.centre)
+        before = apply(torch.from_numpy(start), centre[None])[0]
+        after = apply(torch.from_numpy(pose), centre[None])[0]
+        wanted = self.plan.displacement
+        if not bool(torch.isfinite(moved).all()):
+            status = Status.UNSTABLE
+        else:
+            vertices = moved[2, :3].numpy() @ self.vertices.T + float(moved[2, 3])
+            if vertices.min() < -TRIAL.below or moved[2, 2] < math.cos(TRIAL.tipped):
+                status = Status.DROPPED
+        missed = float(norm(after - before - wanted))
+        if status is Status.OK and missed > TRIAL.slipped:
+            status = Status.SLIPPED
+        motion = self.obj_from_world @ moved @ inverse(self.obj_from_world)
+        return DragResult(
+            status,
+            motion,
+            missed,
+            torch.tensor(forces, dtype=torch.float64),
+        )
+
+
+def _in_world(plan: DragPlan, world_from_obj: Float[Tensor, "4 4"]) -> DragPlan:
+    """Return a drag in the simulator's frame, in float64 on the CPU.
+
+    Its numbers are rounded, so that the frame of the plan does not change the trial.
+    """
+    plan = plan.to("cpu", torch.float64)
+    turn = world_from_obj[:3, :3]
+    return dataclasses.replace(
+        plan,
+        obj_from_hand=rounded(world_from_obj @ plan.obj_from_hand),
+        feet=rounded(apply(world_from_obj, plan.feet)),
+        displacement=rounded(turn @ plan.displacement),
+        table=_rounded_table(plan.table.moved(world_from_obj)),
+    )
+
+
+def _rounded_table(table: Plane) -> Plane:
+    """Return a table whose numbers, and those of its edge, are rounded."""
+    edge = None if table.edge is None else _rounded_table(table.edge)
+    return Plane(rounded(table.normal), round(table.offset, TRIAL.decimals), edge)
+
+
+def _reference(hand: Hand, plan: DragPlan, spec: TrialSpec) -> ClosingReference:
+    """Return what the fingertips' sensors need to know: the fingers touch from above."""
+    f = len(hand.tips)
+    joints = plan.joints
+    normals = (plan.table.normal @ plan.obj_from_hand[:3, :3]).expand(f, 3)
+    still = torch.zeros(f, 3, dtype=torch.float64)
+    gains = ClosingGains(still, torch.zeros(f, 3, 3, dtype=torch.float64), still, still, still)
+    return ClosingReference(
+        hand,
+        drive_stiffness(hand, spec.kp),
+        obj_from_hand=plan.obj_from_hand,
+        pregrasp=joints,
+        joints=joints,
+        squeeze=joints,
+        normals=normals.clone(),
+        gains=gains,
+        sensor=spec.sensor,
+    )

@@ -1,0 +1,456 @@
+"""The plan of a drag: where and how a hand presses on an object, and along which way it moves it.
+
+Searches are in the object's upright frame, on the CPU. p counts pressing postures, t directions
+about the vertical, and f fingertips.
+"""
+
+import dataclasses
+import itertools
+import math
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.foundation.base import Value, flatnonzero
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import ANY, Pose
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import norm, unit
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.signed_distance import DistanceField
+from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.press import PressPostures, press_postures
+from torchgrasp.planner.objects import ShapedObject
+from torchgrasp.scene.occupancy import OCCUPANCY
+
+GRAVITY = 9.81  # acceleration [m/s^2]
+
+
+@dataclasses.dataclass(frozen=True)
+class DragNumbers:
+    """Parameters of a drag to the edge."""
+
+    behind: float = 0.015
+    """Distance [m] behind the edge at which the centre of mass ends: its estimate is 5 mm off."""
+    supported: float = 0.004
+    """Least distance [m] behind the edge of each pressing tip at the end of the drag."""
+    spacing: float = 0.008
+    """Distance [m] of the places on the object's top where the hand may press."""
+    cell: float = 0.001
+    """Spacing [m] of the map of the object's top."""
+    places: int = 60
+    """Number of these places that are tried, those nearest to the centre of mass."""
+    postures: int = 40
+    """Number of postures of two tips, and of one, that are tried at each place."""
+    turns: int = 24
+    """Number of directions about the vertical in which each posture is tried."""
+    upward: float = 0.9
+    """Least upward part of the unit normal where a tip presses: 25 degrees."""
+    rim: float = 0.002
+    """Distance [m] of a pressing tip from the object's outline."""
+    ring: int = 8
+    """Number of points on the circle of radius `rim` that must lie on the object's top."""
+    flat: float = 0.003
+    """Largest difference [m] of heights on this circle."""
+    near: float = 0.0025
+    """Largest horizontal distance [m] of a place on the top from a point of it."""
+    clear: float = 0.003
+    """Least clearance [m] of all other links from the object and the table."""
+    aside: tuple[float, ...] = (0.0, 30.0, -30.0, 60.0, -60.0)
+    """Angles [deg] between the drag and the shortest way to the edge, in the order of trial."""
+    lowered: int = 6
+    """Number of heights at which the hand is checked on its way down."""
+    approach: float = 0.05
+    """Height [m] from which the hand comes down."""
+    steps: int = 8
+    """Number of places on the way along the table at which hand and object are checked."""
+    unloading: float = 0.1
+    """Greatest loss of pressing force for each newton of the drag: then the tips would slip."""
+    digging: float = 0.8
+    """Greatest gain of pressing force for each newton of the drag: then the tips would jam."""
+    reserve: float = 3.0
+    """Ratio of the pressing force to the least one that moves the object."""
+    weights: float = 2.0
+    """Least ratio of the pressing force to the weight: the tips then resist a turn."""
+    pivot: float = 0.004
+    """Largest distance [m] of the centre of mass from the line along which one tip drags."""
+    share: float = 0.25
+    """Share of the friction of two tips that is left to resist a turn."""
+    support: float = 0.005
+    """Distance [m] before and behind a pressing tip to which the top must reach: else it rolls."""
+    carried: float = 1.5
+    """Ratio of the load that grasps must resist to the weight: its lever is known to a third."""
+    least: float = 1.0
+    """Least pressing force [N]: sensors are off by 0.1 N."""
+    most: float = 20.0
+    """Greatest pressing force [N]: thin things bend, and hands are weak."""
+    enough: float = 1.5
+    """Least ratio of the pressing force to the least one, for an object that needs more than `most`.
+    """
+    sure: float = 0.1
+    """Probability that friction is less than the one that the drag counts on."""
+    sunk: float = 0.005
+    """Greatest depth [m] of a pressing tip in the estimated shape: estimates are a few mm off."""
+    ended: float = 0.85
+    """Share of simulated drags of authored bodies that ended as planned."""
+    shortest: float = 0.002
+    """Length [m] of a drag that is not worth while: sensors are off by as much."""
+
+
+DRAG = DragNumbers()
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class DragPlan(Value):
+    """How a hand drags an object along its table: it presses from above, and moves sideways.
+
+    Everything is in the frame of the cloud. f counts fingertips, and h actuated joints.
+
+    Attributes:
+        joints: actuated joints (h,) [rad or m] of the pressing hand; they stay the same.
+        obj_from_hand: pose (4, 4) [m] of the hand's root link where the tips touch the object.
+        presses: mask (f,) of the fingers that press.
+        feet: points (f, 3) [m] where the tips touch; NaN for fingers that do not press.
+        displacement: displacement (3,) [m] of hand and object along the table.
+        force: sum of the normal forces [N] of the pressing fingers.
+        table: the table.
+
+    Tensors of a plan are in float64 on the CPU.
+    """
+
+    joints: Float[Tensor, "h"]
+    obj_from_hand: Pose
+    presses: Bool[Tensor, "f"]
+    feet: Annotated[Float[Tensor, "f 3"], ANY]
+    displacement: Float[Tensor, "3"]
+    force: float
+    table: Plane
+
+
+def find_drag(
+    object_: ShapedObject,
+    hand: Hand,
+    table: Plane,
+    mass: float,
+    friction: float,
+    table_friction: float,
+) -> DragPlan | str:
+    """Return the best drag of an object to its table's edge, or the reason why there is none.
+
+    Args:
+        object_: the object on its table.
+        hand: the hand.
+        table: the table, with an edge, in the frame of the cloud.
+        mass: mass [kg] of the object.
+        friction: coefficient of friction between fingertips and object.
+        table_friction: coefficient of friction between object and table.
+    """
+    assert table.edge is not None
+    centre = centre_of_mass(object_)
+    length = length_to_edge(object_, centre, table)
+    if length <= DRAG.shortest:
+        return "the object hangs over the edge as far as it can"
+    force = pressing_force(mass, friction, table_friction)
+    if force is None:
+        return f"an object of {mass:g} kg is too heavy to drag"
+    if object_.scene is not None and length > OCCUPANCY.sideways:
+        return f"the camera's scene is known only {OCCUPANCY.sideways:g} m around the object"
+    # the torque of the weight's friction, over the friction that is left to two tips
+    lever = 2 * table_friction * mass * GRAVITY / (DRAG.share * friction * force)
+    postures = press_postures(hand)
+    hand = hand.to("cpu", torch.float64)
+    frame = object_.obj_from_upright
+    outward = table.edge.normal.cpu().double()
+    turned = inverse(frame)[:3, :3]
+    ways = list[Float[Tensor, "3"]]()
+    for angle in DRAG.aside:
+        turn = rotation_from_vector(math.radians(angle) * table.normal.cpu().double())
+        ways.append((length / math.cos(math.radians(angle))) * (turn @ outward))
+    ways = [way for way in ways if _is_free(object_, turned @ way)]
+    if not ways:
+        return "a neighbour is in the object's way to the edge"
+    # two tips resist a turn of the object; a narrow one would roll unless it is dragged along
+    for tips, displacement in itertools.product((2, 1), ways):
+        search = _Search(object_, hand, postures, centre, turned @ outward, turned @ displacement)
+        found = search.place(tips, force, lever)
+        if found is None:
+            continue
+        at, upright_from_press = found
+        obj_from_press = frame @ upright_from_press
+        presses = postures.presses[at]
+        feet = apply(obj_from_press, postures.feet[at])
+        return DragPlan(
+            joints=postures.joints[at],
+            obj_from_hand=obj_from_press @ postures.press_from_hand[at],
+            presses=presses,
+            feet=torch.where(presses[:, None], feet, torch.nan),
+            displacement=displacement,
+            force=force,
+            table=table,
+        )
+    return "no posture of the hand presses on the object from above, clear of all else"
+
+
+def length_to_edge(object_: ShapedObject, centre: Float[Tensor, "3"], table: Plane) -> float:
+    """Return how far [m] the object must be dragged, so that its centre of mass is `DRAG.behind`
+    behind the edge.
+
+    It is negative if the centre is nearer to the edge, or beyond it. `centre` [m] is in the upright
+    frame.
+    """
+    assert table.edge is not None
+    in_cloud = apply(object_.obj_from_upright, centre[None])[0]
+    return -float(table.edge.height(in_cloud)) - DRAG.behind
+
+
+def pressing_force(mass: float, friction: float, table_friction: float) -> float | None:
+    """Return the pressing force [N] that drags an object of a `mass` [kg] (Coulomb's law); None if
+    the object is too heavy.
+
+    A force N moves it if the fingers' friction N is at least the table's friction times N plus the
+    weight.
+    """
+    weight = mass * GRAVITY
+    least = table_friction * weight / (friction - table_friction)
+    if DRAG.enough * least > DRAG.most:
+        return None
+    return min(max(DRAG.reserve * least, DRAG.weights * weight, DRAG.least), DRAG.most)
+
+
+def centre_of_mass(object_: ShapedObject) -> Float[Tensor, "3"]:
+    """Return the centroid [m] of the volume within the estimated surface, in the upright frame.
+
+    Each triangle and the mean vertex span a tetrahedron. The centroid is the mean of theirs, with
+    their signed volumes as weights.
+    """
+    vertices = object_.surface.vertices.cpu().double()
+    middle = vertices.mean(0)
+    corners = (vertices - middle)[object_.surface.faces.cpu()]  # (f, 3, 3)
+    volumes = torch.linalg.det(corners)
+    return middle + (volumes[:, None] * corners.sum(1)).sum(0) / (4 * volumes.sum())
+
+
+@dataclasses.dataclass(frozen=True)
+class _Search:
+    """The search for a pressing posture and its place on an object.
+
+    `centre` [m] is the centre of mass, the unit vector `edge` points to the table's edge, and `way`
+    [m] is the displacement of hand and object.
+    """
+
+    object_: ShapedObject
+    hand: Hand
+    postures: PressPostures
+    centre: Float[Tensor, "3"]
+    edge: Float[Tensor, "3"]
+    way: Float[Tensor, "3"]
+
+    def place(
+        self, tips: int, force: float, lever: float
+    ) -> tuple[int, Float[Tensor, "4 4"]] | None:
+        """Return the index of the best posture that presses with one or two `tips`, and its pose (4,
+        4) [m] on the object.
+
+        None if no posture fits. `force` [N] is the sum of the tips' normal forces. Two tips must be
+        at least `lever` times as far apart as the centre of mass is off the line of their drag.
+        """
+        postures = self.postures
+        outward = unit(self.way)
+        sideways = torch.stack([-outward[1], outward[0], torch.zeros_like(outward[0])])
+        top = _Top(_facing_up(self.object_), outward)
+        places = top.places(self.centre, self.edge)
+        share = postures.presses.sum(1).double()
+        able = flatnonzero(postures.strength >= force / share)
+        angles = torch.arange(DRAG.turns, device="cpu").double() * (2 * math.pi / DRAG.turns)
+        turns = _turns(angles)  # (t, 3, 3)
+        steady = _is_steady(postures, turns.mT @ outward)  # (p, t)
+        rows = able[postures.presses[able].sum(1) == tips][: DRAG.postures]
+        presses = postures.presses[rows][:, None]
+        apart = _apart(postures.feet[rows], postures.presses[rows])
+        turned = (turns @ postures.feet[rows][:, None].mT).mT  # (p, t, f, 3)
+        for place in places:
+            off = abs(float((self.centre - place) @ sideways))
+            straight = lever * off <= apart
+            if tips == 1:
+                straight = torch.full_like(straight, off <= DRAG.pivot)
+            feet = turned + place
+            ahead = ((feet - self.centre) @ self.edge).where(presses, -math.inf).amax(2)
+            height, flat = top.stand(feet)
+            low = height.where(presses, math.inf).amin(2)
+            high = height.where(presses, -math.inf).amax(2)
+            good = straight[:, None] & steady[rows] & (flat | ~presses).all(2)
+            good &= high - low <= DRAG.flat
+            good &= ahead <= DRAG.behind - DRAG.supported
+            for p, t in torch.nonzero(good).tolist():
+                at = int(rows[p])
+                pose = rigid(turns[t], torch.stack([place[0], place[1], high[p, t]]))
+                if self.is_clear(at, pose):
+                    return at, pose
+        return None
+
+    def is_clear(self, at: int, pose: Float[Tensor, "4 4"]) -> bool:
+        """Return whether a hand presses with its pressing tips alone, and keeps clear of all else.
+
+        The hand is in the posture with index `at` at a `pose` [m]. It comes down from above, and
+        moves with the object along the way, clear of the table and of the object's neighbours.
+        """
+        spheres = self.hand.collision_spheres
+        pressing = flatnonzero(self.postures.presses[at])
+        tips = spheres.touching & torch.isin(spheres.finger, pressing)
+        centres = apply(pose, self.postures.spheres[at])
+        radius = spheres.radius.to(centres)
+        # under a handle, say, a tip would have to go through the object
+        if _gap(self.object_.body.field, centres[tips], radius[tips]) < -DRAG.sunk:
+            return False
+        centres, radius = centres[~tips], radius[~tips]
+        if float((centres[:, 2] - radius).min()) < DRAG.clear:
+            return False
+        heights = torch.linspace(0, DRAG.approach, DRAG.lowered, dtype=torch.float64, device="cpu")
+        up = torch.eye(3, dtype=torch.float64, device="cpu")[2]
+        down = centres + heights[:, None, None] * up
+        if _gap(self.object_.body.field, down, radius) < DRAG.clear:
+            return False
+        if self.object_.obstacles is None:
+            return True
+        path = torch.cat([down, centres + _shares()[:, None, None] * self.way])
+        return _gap(self.object_.obstacles.field, path, radius) >= DRAG.clear
+
+
+def _apart(feet: Float[Tensor, "p f 3"], presses: Bool[Tensor, "p f"]) -> Float[Tensor, "p"]:
+    """Return the distance [m] of the two pressing tips of each posture; 0 for one tip."""
+    both = presses[:, :, None] & presses[:, None, :]
+    return (torch.cdist(feet, feet) * both).flatten(1).amax(1)
+
+
+def _is_steady(postures: PressPostures, ways: Float[Tensor, "t 3"]) -> Bool[Tensor, "p t"]:
+    """Return whether each posture presses on steadily while it drags along each of `ways`.
+
+    Where a tip sticks, a motion of the palm along the unit vector w changes the tip's force by K w,
+    for its stiffness K. So each newton of the drag, w . K w, changes the pressing force by
+    -z . K w.
+    """
+    force = torch.einsum("pfij,tj->ptfi", postures.stiffness, ways)
+    along = (force * ways[:, None]).sum(-1)
+    change = -force[..., 2] / along
+    steady = (change >= -DRAG.unloading) & (change <= DRAG.digging)
+    return (steady | ~postures.presses[:, None]).all(2)
+
+
+def _turns(angles: Float[Tensor, "t"]) -> Float[Tensor, "t 3 3"]:
+    """Return the rotations about the vertical by `angles` [rad]."""
+    cosine, sine = torch.cos(angles), torch.sin(angles)
+    zero, one = torch.zeros_like(angles), torch.ones_like(angles)
+    rows = [cosine, -sine, zero, sine, cosine, zero, zero, zero, one]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+class _Top:
+    """A map of an object's top, seen from above, on a grid with the spacing `DRAG.cell` [m].
+
+    Args:
+        corners: those of the triangles (k, 3, 3) [m] of the surface that face up.
+        outward: unit vector along which the object is dragged.
+
+    Attributes:
+        height: height (n, m) [m] of the top at each node.
+        stands: whether a tip can press at each node (n, m): the top is flat around it.
+    """
+
+    def __init__(self, corners: Float[Tensor, "k 3 3"], outward: Float[Tensor, "3"]) -> None:
+        from scipy.spatial import KDTree
+
+        # points all over the triangles
+        faces = np.arange(3 * len(corners)).reshape(-1, 3)
+        vertices = corners.flatten(0, 1).numpy()
+        dense = trimesh.remesh.subdivide_to_size(vertices, faces, max_edge=DRAG.near)[0]
+        points = torch.from_numpy(dense)
+        margin = DRAG.rim + DRAG.support + DRAG.cell
+        self.low = points[:, :2].amin(0) - margin
+        n, m = ((points[:, :2].amax(0) + margin - self.low) / DRAG.cell).ceil().long().tolist()
+        steps = torch.cartesian_prod(
+            torch.arange(n + 1, device="cpu"), torch.arange(m + 1, device="cpu")
+        ).double()
+        nodes = self.low + DRAG.cell * steps
+        gap, index = KDTree(points[:, :2].numpy()).query(nodes.numpy())
+        index = torch.from_numpy(index)
+        self.height = points[index, 2].view(n + 1, m + 1)
+        seen = (torch.from_numpy(gap) <= DRAG.near).view(n + 1, m + 1)
+        angles = torch.arange(DRAG.ring, device="cpu").double() * (2 * math.pi / DRAG.ring)
+        ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
+        # before and behind the tip the top must reach farther
+        along = DRAG.support * torch.stack([outward[:2], -outward[:2]])
+        around = torch.cat([ring.new_zeros(1, 2), ring, along])
+        height, seen = self._look(self.height, seen, nodes[:, None] + around)
+        low, high = height.aminmax(dim=1)
+        flat = seen.all(1) & (high - low <= DRAG.flat)
+        self.stands = flat.view(n + 1, m + 1)
+        self.nodes = nodes[flat]
+
+    def _look(
+        self, height: Float[Tensor, "n m"], good: Bool[Tensor, "n m"], places: Float[Tensor, "*b 2"]
+    ) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
+        """Return both maps at the nodes nearest to `places` [m]; beyond the maps nothing is good."""
+        index = ((places - self.low) / DRAG.cell).round().long()
+        size = torch.tensor(height.shape, device="cpu")
+        inside = ((index >= 0) & (index < size)).all(-1)
+        row, column = torch.where(inside[..., None], index, 0).unbind(-1)
+        return height[row, column], good[row, column] & inside
+
+    def stand(self, feet: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
+        """Return the height [m] of the top below each of `feet` [m], and whether a tip can press."""
+        return self._look(self.height, self.stands, feet[..., :2])
+
+    def places(self, centre: Float[Tensor, "3"], edge: Float[Tensor, "3"]) -> Float[Tensor, "k 3"]:
+        """Return places [m] on the top, far enough from the edge, those nearest to the `centre`
+        first.
+
+        `edge` is the unit vector towards the edge.
+        """
+        cells = torch.round((self.nodes - centre[:2]) / DRAG.spacing)
+        _, cell = torch.unique(cells, dim=0, return_inverse=True)
+        count = torch.bincount(cell)
+        places = torch.zeros(len(count), 3, dtype=torch.float64, device="cpu")
+        # the mean of the nodes in each cell: on a narrow object it lies on its ridge
+        places[:, :2].index_add_(0, cell, self.nodes)
+        places = places / count[:, None]
+        places = places[(places - centre) @ edge <= DRAG.behind - DRAG.supported]
+        distance = norm((places - centre)[:, :2])
+        return places[torch.argsort(distance, stable=True)][: DRAG.places]
+
+
+def _facing_up(object_: ShapedObject) -> Float[Tensor, "k 3 3"]:
+    """Return the corners [m] of the triangles of an object's surface that face up."""
+    vertices = object_.surface.vertices.cpu().double()
+    corners = vertices[object_.surface.faces.cpu()]  # (f, 3, 3)
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = norm(normals).clamp_min(torch.finfo(normals.dtype).tiny)
+    return corners[normals[:, 2] > DRAG.upward * size]
+
+
+def _is_free(object_: ShapedObject, way: Float[Tensor, "3"]) -> bool:
+    """Return whether no neighbour is in the object's way along the table."""
+    if object_.obstacles is None:
+        return True
+    vertices = object_.surface.vertices.cpu().double()
+    path = vertices + _shares()[:, None, None] * way
+    field = object_.obstacles.field
+    before = field.query(vertices.to(field.nodes))[0].min()
+    nearest = field.query(path.flatten(0, 1).to(field.nodes))[0].min()
+    # noise of the grid may let the object touch an obstacle where it stands
+    return bool(nearest >= torch.clamp(before, max=0.0))
+
+
+def _shares() -> Float[Tensor, "k"]:
+    """Return the shares of the way at which collisions are checked."""
+    return torch.linspace(0, 1, DRAG.steps, dtype=torch.float64, device="cpu")
+
+
+def _gap(field: DistanceField, path: Float[Tensor, "*k s 3"], radius: Float[Tensor, "s"]) -> float:
+    """Return the least clearance [m] of spheres on a path from a field's surface."""
+    distance = field.query(path.to(field.nodes))[0].cpu()
+    return float((distance - radius.to(distance)).min())

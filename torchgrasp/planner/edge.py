@@ -1,0 +1,175 @@
+"""Grasps of a low object at the edge of its table: the hand drags it there, then grasps what hangs
+over.
+
+A fingertip cannot reach below an object that lies flat. So the hand presses on it from above, and
+drags it until a part hangs over the edge, while its centre of mass stays above the table. The
+fingers then pinch this part from above and below.
+"""
+
+import dataclasses
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.data.accept import HandLike, SeenLike, as_hand, as_seen
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.rules import Count, Range, Seed
+from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.geometry.frames import apply, inverse, rigid
+from torchgrasp.geometry.plane import Plane, move
+from torchgrasp.ik.clearance import Obstacles
+from torchgrasp.planner.drag_plan import (
+    DRAG,
+    GRAVITY,
+    DragPlan,
+    centre_of_mass,
+    find_drag,
+    length_to_edge,
+)
+from torchgrasp.planner.drag_text import with_drag
+from torchgrasp.planner.objects import ShapedObject
+from torchgrasp.planner.request import Request
+from torchgrasp.planner.run import plan_shaped
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.success.task import GraspTask, TaskWrenches
+from torchgrasp.values.distribution import Distribution
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import ContactSpec
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class EdgePlan(Value):
+    """A drag to the table's edge, and the grasps there; `plan_edge_grasps` returns it.
+
+    Attributes:
+        drag: the drag; None if there is none, for which `reason` tells why.
+        grasps: grasps of the object after the drag, or of the object where it stands without one.
+            They are in the frame of the cloud, the best first, as those of `plan_grasps`. Their
+            metadata hold the drag (`torchgrasp.planner.drag_of`), so that one file has both.
+        shape: the estimated shape after the drag, in the same frame.
+        reason: why there is no drag: the object hangs over the edge far enough, or is too heavy, or
+            no posture of the hand can press on it, or a neighbour is in its way. Or the edge is too
+            far for what the camera saw of a scene. Empty if there is a drag.
+    """
+
+    drag: DragPlan | None
+    grasps: Grasps
+    shape: ShapeGP
+    reason: str = ""
+
+    @property
+    def success(self) -> float:
+        """The predicted success of the first grasp, in [0, 1], times that of the drag.
+
+        The latter is the share of simulated drags that ended as planned (`DRAG.ended`). The result
+        is 0 without an executable grasp, and NaN if its success is unknown.
+        """
+        good = self.grasps[self.grasps.status == Status.OK]
+        if not len(good):
+            return 0.0
+        sure = 1.0 if self.drag is None else DRAG.ended
+        return sure * float(good.success[0])
+
+
+@checked
+@single_threaded
+def plan_edge_grasps(
+    cloud: SeenLike,
+    hand: HandLike,
+    spec: ContactSpec,
+    starts: Count = 1000,
+    seed: Seed = 0,
+    *,
+    task: GraspTask | None = None,
+    table_friction: Annotated[float, Range(0.0, 10.0)] = 0.3,
+) -> EdgePlan:
+    """Plan to drag the object to the edge of its table, and grasps there; return both.
+
+    The grasps resist half as much weight again (`DRAG.carried`), as with the argument `resist` of
+    `plan_grasps`.
+
+    Args:
+        cloud: points that a camera saw [m], as for `plan_grasps`.
+        hand: the hand, or its name or folder.
+        spec: constraints. Its `table` must be a plane with an `edge` (`Plane.ending`). Its region
+            is where the object lies before the drag, and moves with it. The drag counts on the tenth
+            quantile of its friction (`DRAG.sure`), if that is a distribution.
+        starts: number of random initial guesses of the contact planner.
+        seed: random seed.
+        task: what grasps must do; None means `GraspTask()`. The greatest mass of a distribution is
+            dragged.
+        table_friction: coefficient of friction between object and table. The pressing force is
+            three times (`DRAG.reserve`) the least one that moves the object (Coulomb's law).
+
+    Raises:
+        BadArgument: a table without an edge, or one whose edge is more than 15 mm (`DRAG.behind`)
+            behind the object's estimated centre of mass: the object would fall.
+        BadArgument: a friction of the fingertips that is not greater than `table_friction`.
+
+    >>> import torch
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.geometry import Plane
+    >>> x = torch.tensor([1.0, 0, 0])
+    >>> spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.2 * x, x))
+    >>> plan = plan_edge_grasps(load_object("cylinder"), load_hand("barrett"), spec, starts=8)
+    """
+    table = spec.plane
+    if table is None or table.edge is None:
+        found = "no table" if table is None else "a table without an edge"
+        raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
+    sure = torch.tensor(DRAG.sure, dtype=torch.float64)
+    friction = float(Distribution.of(spec.friction).quantile(sure))
+    if not friction > table_friction:
+        found = f"{table_friction:g}, and {friction:g} of the fingertips"
+        raise BadArgument("table_friction", found, "less than the friction of the fingertips")
+    hand = as_hand(hand, "hand")
+    request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
+    object_ = ShapedObject.of(request)
+    shape = object_.shape.moved(object_.obj_from_upright)
+    centre = centre_of_mass(object_)
+    length = length_to_edge(object_, centre, table)
+    if length < -2 * DRAG.behind:
+        found = f"an edge {-1e3 * (length + DRAG.behind):.0f} mm behind the object's centre"
+        raise BadArgument("spec.table", found, "an edge beyond it")
+    mass = Distribution.of(request.grasp_task.mass).most
+    load = _weight(mass, table, apply(object_.obj_from_upright, centre[None])[0])
+    request = dataclasses.replace(request, resist=load)
+    drag = find_drag(object_, hand, table, mass, friction, table_friction)
+    if isinstance(drag, str):
+        return EdgePlan(None, plan_shaped(object_, request), shape, drag)
+    # for the object, the edge comes nearer
+    shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
+    nearer = dataclasses.replace(table, edge=table.edge.moved(inverse(shift)))
+    obstacles = _brought(object_, drag.displacement)
+    object_ = dataclasses.replace(object_, table=nearer, obstacles=obstacles)
+    grasps = plan_shaped(object_, request)
+    grasps = move(grasps, shift)
+    grasps = dataclasses.replace(grasps, meta={**grasps.meta, "table": table.describe()})
+    return EdgePlan(drag, with_drag(grasps, drag), shape.moved(shift))
+
+
+def _weight(mass: float, table: Plane, centre: Float[Tensor, "3"]) -> TaskWrenches:
+    """Return the load that grasps must resist: the weight of a `mass` [kg], with a reserve, at the
+    `centre` [m].
+
+    The hand grasps the object beside its centre of mass, so that its weight would turn it.
+    """
+    force = -DRAG.carried * mass * GRAVITY * table.normal.double()
+    return TaskWrenches(torch.cat([force, torch.zeros_like(force)])[None], centre)
+
+
+def _brought(object_: ShapedObject, displacement: Float[Tensor, "3"]) -> Obstacles | None:
+    """Return the obstacles as the object finds them after a `displacement` [m]: they have come the
+    other way.
+    """
+    if object_.obstacles is None:
+        return None
+    field = object_.obstacles.field
+    way = inverse(object_.obj_from_upright)[:3, :3] @ displacement
+    field = dataclasses.replace(field, origin=field.origin - way.to(field.origin))
+    return dataclasses.replace(object_.obstacles, field=field)
