@@ -70,12 +70,12 @@ def test_the_box_goes_where_the_plan_wants_it(name, simulator):
 
 def test_a_box_is_dragged_to_the_edge_and_lifted_there():
     pytest.importorskip("sapien")
-    hand, plan = dragged("barrett")
+    hand, plan = dragged("allegro")
     lift = lift_from_edge(plan, hand, BOX, SPEC, parts=[BOX])
     assert lift.held and len(lift.tries) == 1
     assert lift.drag is not None
     # the drag is that of `drag_object`, to the last bit
-    again = trial("barrett", "sapien")
+    again = trial("allegro", "sapien")
     assert same_bits(lift.drag, again) and lift.drag.missed == again.missed
     assert float(lift.tries[0].result.object_pose[-1][2, 3]) > 0.05
 

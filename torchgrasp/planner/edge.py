@@ -25,10 +25,9 @@ from torchgrasp.ik.clearance import Obstacles
 from torchgrasp.planner.drag_plan import (
     DRAG,
     GRAVITY,
+    Balance,
     DragPlan,
-    centre_of_mass,
     find_drag,
-    length_to_edge,
 )
 from torchgrasp.planner.drag_text import with_drag
 from torchgrasp.planner.objects import ShapedObject
@@ -131,13 +130,12 @@ def plan_edge_grasps(
     request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
     object_ = ShapedObject.of(request)
     shape = object_.shape.moved(object_.obj_from_upright)
-    centre = centre_of_mass(object_)
-    length = length_to_edge(object_, centre, table)
-    if length < -2 * DRAG.behind:
-        found = f"an edge {-1e3 * (length + DRAG.behind):.0f} mm behind the object's centre"
+    balance = Balance.of(object_, table)
+    if balance.away < -DRAG.behind:
+        found = f"an edge {-1e3 * balance.away:.0f} mm behind the object's centre"
         raise BadArgument("spec.table", found, "an edge beyond it")
     mass = Distribution.of(request.grasp_task.mass).most
-    load = _weight(mass, table, apply(object_.obj_from_upright, centre[None])[0])
+    load = _weight(mass, table, apply(object_.obj_from_upright, balance.centre[None])[0])
     request = dataclasses.replace(request, resist=load)
     drag = find_drag(object_, hand, table, mass, friction, table_friction)
     if isinstance(drag, str):
