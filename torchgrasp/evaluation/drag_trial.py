@@ -47,10 +47,14 @@ class DragTrialNumbers:
 
     rest: float = 0.5
     """Time [s] after the drag in which the object comes to rest."""
-    fallen: float = 0.01
-    """Fall [m] of the object's centre of mass, or"""
+    below: float = 0.005
+    """Depth [m] of the object's lowest point below the table from which it falls over the edge."""
     tipped: float = math.radians(10)
-    """turn [rad] of its vertical, from which it has fallen off the table."""
+    """Turn [rad] of the object's vertical from which it has toppled."""
+    slipped: float = 0.02
+    """Distance [m] from the planned place beyond which the tips slid over the object."""
+    table_friction: float = 0.3
+    """Coefficient of friction between object and table by default: that of `plan_edge_grasps`."""
     decimals: int = 9
     """Decimals to which offsets [m] of the table and its edge are rounded."""
 
@@ -65,8 +69,9 @@ class DragResult(Value):
 
     Attributes:
         status: `OK`; `NO_CONTACT` if the hand could not press, or lost the object on the way;
-            `DROPPED` if the object fell off the table; `START_OVERLAP` or `UNSTABLE` as in
-            `close_hand`.
+            `DROPPED` if the object toppled, or hangs or fell over the edge; `SLIPPED` if it is
+            more than 20 mm (`TRIAL.slipped`) from where the plan wanted it; `START_OVERLAP` or
+            `UNSTABLE` as in `close_hand`.
         motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform; NaN if
             the drag is `UNSTABLE`.
         missed: distance [m] of the object's centre of mass from where the plan wanted it; NaN in
@@ -99,7 +104,8 @@ def drag_object(
         hand: the hand of the plan.
         mesh: the true object [m], closed, in the frame of the plan: a trimesh, a file, or a
             `GraspObject`.
-        spec: parameters of the trial; None means `TrialSpec()`. Its closing is not used.
+        spec: parameters of the trial. None means a table with a friction of 0.3, as planned by
+            default: `TrialSpec(table_friction=0.3)`. The closing is not used.
         seed: seed of the sensors' noise, and of friction and mass if the `spec` has distributions
             of them.
         parts: convex parts [m] of the mesh. None means those of a `GraspObject`, or those that
@@ -112,6 +118,17 @@ def drag_object(
         BadArgument: a sensor that measures no force, at all or at a finger that presses.
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
+
+    >>> import torch
+    >>> from torchgrasp import ContactSpec, Plane, load_hand, plan_edge_grasps
+    >>> from torchgrasp.cloud import look_at, partial_view
+    >>> box = trimesh.creation.box([0.12, 0.06, 0.01]).apply_translation([0.0, 0.0, 0.005])
+    >>> view, hand = partial_view(box, look_at(-135.0, 40.0, target=box)), load_hand("barrett")
+    >>> x = torch.tensor([1.0, 0, 0])
+    >>> spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.15 * x, x))
+    >>> plan = plan_edge_grasps(view, hand, spec, starts=2)
+    >>> drag_object(plan.drag, hand, box, TrialSpec(table_friction=0.3), parts=[box]).status
+    <Status.OK: 0>
     """
     if isinstance(mesh, GraspObject):
         parts = mesh.parts if parts is None else parts
@@ -119,7 +136,7 @@ def drag_object(
     solid = read_mesh(mesh)
     table = plan.table if table is None else table
     check_stand(solid, table)
-    spec = draw_trial(TrialSpec() if spec is None else spec, seed)
+    spec = draw_trial(_choose(spec), seed)
     _check_sensor(spec.sensor, plan, hand)
     return _Drag(plan, hand.to("cpu", torch.float64), solid, parts, table, spec, seed).complete()
 
@@ -173,7 +190,7 @@ def lift_from_edge(
         plan: drag and grasps, from `plan_edge_grasps`, with at least one executable grasp.
         hand: the hand of the plan.
         mesh: the true object [m], as for `drag_object`.
-        spec: parameters of both trials; None means `TrialSpec()`.
+        spec: parameters of both trials; None means the default of `drag_object`.
         seed: seed of both trials.
         tries: largest number of grasps that are tried (`lift_grasps`).
         parts: convex parts [m] of the mesh, as for `drag_object`.
@@ -181,6 +198,18 @@ def lift_from_edge(
 
     Raises the errors of `drag_object` and `lift_grasps`, and `BadArgument` for a plan without an
     executable grasp.
+
+    >>> import torch
+    >>> from torchgrasp import ContactSpec, Plane, load_hand, plan_edge_grasps
+    >>> from torchgrasp.cloud import look_at, partial_view
+    >>> box = trimesh.creation.box([0.12, 0.06, 0.01]).apply_translation([0.0, 0.0, 0.005])
+    >>> view, hand = partial_view(box, look_at(-135.0, 40.0, target=box)), load_hand("barrett")
+    >>> x = torch.tensor([1.0, 0, 0])
+    >>> spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.15 * x, x))
+    >>> plan = plan_edge_grasps(view, hand, spec, starts=8)
+    >>> trial = TrialSpec(table_friction=0.3, hold_time=0.2)
+    >>> lift_from_edge(plan, hand, box, trial, parts=[box]).held
+    True
     """
     good = plan.grasps[plan.grasps.status == Status.OK]
     if not len(good):
@@ -203,7 +232,12 @@ def lift_from_edge(
             return EdgeLift(drag, ())
     truth = Truth(solid, pieces, table=table)
     trial = GraspTrial(hand, good, truth, seed, surface=surface_field(plan.shape))
-    return EdgeLift(drag, lift_grasps(trial, spec, tries))
+    return EdgeLift(drag, lift_grasps(trial, _choose(spec), tries))
+
+
+def _choose(spec: TrialSpec | None) -> TrialSpec:
+    """Return the parameters of a trial; by default the table has the friction that plans expect."""
+    return TrialSpec(table_friction=TRIAL.table_friction) if spec is None else spec
 
 
 class _Drag:
@@ -253,6 +287,7 @@ class _Drag:
             + DRAGGING.deepest,
             start=tuple(start.tolist()),
         )
+        self.vertices = np.asarray(solid.vertices)
         self.scene = open_scene(scene_spec, spec.simulator)
         generator = torch.Generator().manual_seed(seed) if spec.noise else None
         self.robot = SimulatedHand(
@@ -286,15 +321,19 @@ class _Drag:
         before = apply(torch.from_numpy(start), centre[None])[0]
         after = apply(torch.from_numpy(pose), centre[None])[0]
         wanted = self.plan.displacement
+        missed = float(norm(after - before - wanted))
+        lowest = float((moved[2, :3].numpy() @ self.vertices.T + float(moved[2, 3])).min())
         if not bool(torch.isfinite(moved).all()):
             status = Status.UNSTABLE
-        elif after[2] < before[2] - TRIAL.fallen or moved[2, 2] < math.cos(TRIAL.tipped):
-            status = Status.DROPPED
+        elif lowest < -TRIAL.below or moved[2, 2] < math.cos(TRIAL.tipped):
+            status = Status.DROPPED  # whatever became of the hand
+        elif status is Status.OK and missed > TRIAL.slipped:
+            status = Status.SLIPPED
         motion = self.obj_from_world @ moved @ inverse(self.obj_from_world)
         return DragResult(
             status,
             motion,
-            float(norm(after - before - wanted)),
+            missed,
             torch.tensor(forces, dtype=torch.float64),
         )
 
