@@ -192,6 +192,7 @@ def plan_edge_grasps(
     if table is None or table.edge is None:
         found = "no table" if table is None else "a table without an edge"
         raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
+    table = table.to("cpu", torch.float64)
     sure = torch.tensor(DRAG.sure, dtype=torch.float64)
     friction = float(Distribution.of(spec.friction).quantile(sure))
     if not friction > table_friction:
