@@ -321,13 +321,14 @@ class _Drag:
         before = apply(torch.from_numpy(start), centre[None])[0]
         after = apply(torch.from_numpy(pose), centre[None])[0]
         wanted = self.plan.displacement
-        missed = float(norm(after - before - wanted))
-        lowest = float((moved[2, :3].numpy() @ self.vertices.T + float(moved[2, 3])).min())
         if not bool(torch.isfinite(moved).all()):
             status = Status.UNSTABLE
-        elif lowest < -TRIAL.below or moved[2, 2] < math.cos(TRIAL.tipped):
-            status = Status.DROPPED  # whatever became of the hand
-        elif status is Status.OK and missed > TRIAL.slipped:
+        else:
+            vertices = moved[2, :3].numpy() @ self.vertices.T + float(moved[2, 3])
+            if vertices.min() < -TRIAL.below or moved[2, 2] < math.cos(TRIAL.tipped):
+                status = Status.DROPPED
+        missed = float(norm(after - before - wanted))
+        if status is Status.OK and missed > TRIAL.slipped:
             status = Status.SLIPPED
         motion = self.obj_from_world @ moved @ inverse(self.obj_from_world)
         return DragResult(
