@@ -118,9 +118,11 @@ def plan_edge_grasps(
     >>> plan = plan_edge_grasps(load_object("cylinder"), load_hand("barrett"), spec, starts=8)
     """
     table = spec.plane
-    if table is None or table.edge is None:
+    edge = None if table is None else table.edge
+    if table is None or edge is None:
         found = "no table" if table is None else "a table without an edge"
         raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
+    table = table.to("cpu", torch.float64)
     sure = torch.tensor(DRAG.sure, dtype=torch.float64)
     friction = float(Distribution.of(spec.friction).quantile(sure))
     if not friction > table_friction:
@@ -142,7 +144,7 @@ def plan_edge_grasps(
         return EdgePlan(None, plan_shaped(object_, request), shape, drag)
     # for the object, the edge comes nearer
     shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
-    nearer = dataclasses.replace(table, edge=table.edge.moved(inverse(shift)))
+    nearer = dataclasses.replace(table, edge=edge.moved(inverse(shift)))
     obstacles = _brought(object_, drag.displacement)
     object_ = dataclasses.replace(object_, table=nearer, obstacles=obstacles)
     grasps = plan_shaped(object_, request)
