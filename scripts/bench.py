@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
-* close: table-lift, success: lifts, predicted success
+* close: table-lift, success, edge: lifts, predicted success, low bodies near a corner
 
 * headline: lifts, low, pulls, region, rendered, real, pace: what README says; --publish writes it
 

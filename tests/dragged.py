@@ -42,5 +42,5 @@ def dragged(name: str) -> Dragged:
     """The plan of a hand."""
     hand = load_hand(name)
     spec = ContactSpec(FRICTION, table=ending(DISTANCE))
-    plan = plan_edge_grasps(VIEW, hand, spec, starts=64, table_friction=TABLE_FRICTION)
+    plan = plan_edge_grasps(VIEW, hand, spec, starts=32, table_friction=TABLE_FRICTION)
     return Dragged(hand, plan)

@@ -221,8 +221,10 @@ def test_plans_that_fit_no_drag_of_the_hand_are_refused():
     with pytest.raises(BadArgument, match=r"plan: expected a plan of this hand"):
         DragController(plan, load_hand("leap"))
     still = dataclasses.replace(plan, displacement=torch.zeros(3).double())
-    with pytest.raises(BadArgument, match=r"plan: .*no displacement"):
+    with pytest.raises(BadArgument, match=r"plan: expected one along the table"):
         DragController(still, hand)
+    with pytest.raises(BadArgument, match=r"plan: expected a positive one, got a force of -1 N"):
+        DragController(dataclasses.replace(plan, force=-1.0), hand)
     none = dataclasses.replace(plan, presses=torch.zeros(3, dtype=torch.bool))
     with pytest.raises(BadArgument, match=r"plan: .*no finger that presses"):
         DragController(none, hand)

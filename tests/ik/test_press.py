@@ -2,6 +2,7 @@
 from statics.
 """
 
+import dataclasses
 import functools
 
 import pytest
@@ -11,7 +12,7 @@ from tests.make import load_hand, near, same_bits
 from tests.settings import other_settings
 from torchgrasp.foundation.base import named_tensors
 from torchgrasp.geometry.frames import apply
-from torchgrasp.ik.press import PRESS, press_postures
+from torchgrasp.ik.press import PRESS, PressPostures, press_postures
 
 HANDS = ["allegro", "barrett", "leap", "shadow"]
 STEP = 1e-6
@@ -131,3 +132,11 @@ def test_the_seed_alone_determines_the_postures():
         x.dtype in (torch.float64, torch.bool) and x.device.type == "cpu"
         for x in named_tensors(single).values()
     )
+
+
+def test_a_hand_none_of_whose_postures_press_has_none(monkeypatch):
+    hand, _ = found("barrett")
+    none = dataclasses.replace(PRESS, gap=1.0)
+    monkeypatch.setattr("torchgrasp.ik.press.PRESS", none)
+    assert len(press_postures(hand, seed=2)) == 0
+    del hand.derived[PressPostures, 2]

@@ -87,8 +87,8 @@ class DragController:
             It then rises at once.
         targets: the present targets, those of the last `step`.
 
-    Raises `BadArgument` for a plan of another hand, without a pressing finger, or without a
-    displacement.
+    Raises `BadArgument` for a plan of another hand, without a pressing finger or a positive force,
+    or without a displacement.
     """
 
     @checked
@@ -99,6 +99,8 @@ class DragController:
         plan = plan.to("cpu", torch.float64)
         if not bool(plan.presses.any()):
             raise BadArgument("plan", "no finger that presses", "one or two")
+        if not plan.force > 0.0:
+            raise BadArgument("plan", f"a force of {plan.force:g} N", "a positive one")
         if not bool(plan.displacement.any()):
             raise BadArgument("plan", "no displacement", "one along the table")
         turn = plan.obj_from_hand[:3, :3]

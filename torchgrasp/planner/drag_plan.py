@@ -35,7 +35,9 @@ class DragNumbers:
     """Parameters of a drag to the edge."""
 
     behind: float = 0.015
-    """Distance [m] behind the edge at which the centre of mass ends: its estimate is 5 mm off."""
+    """Least distance [m] behind the edge at which the centre of mass ends, or"""
+    unsure: float = 0.25
+    """this share of the object's reach from its centre to the edge: so far off are estimates."""
     supported: float = 0.004
     """Least distance [m] behind the edge of each pressing tip at the end of the drag."""
     spacing: float = 0.008
@@ -151,8 +153,8 @@ def find_drag(
         table_friction: coefficient of friction between object and table.
     """
     assert table.edge is not None
-    centre = centre_of_mass(object_)
-    length = length_to_edge(object_, centre, table)
+    balance = Balance.of(object_, table)
+    length = balance.length
     if length <= DRAG.shortest:
         return "the object hangs over the edge as far as it can"
     force = pressing_force(mass, friction, table_friction)
@@ -176,7 +178,7 @@ def find_drag(
         return "a neighbour is in the object's way to the edge"
     # two tips resist a turn of the object; a narrow one would roll unless it is dragged along
     for tips, displacement in itertools.product((2, 1), ways):
-        search = _Search(object_, hand, postures, centre, turned @ outward, turned @ displacement)
+        search = _Search(object_, hand, postures, balance, turned @ displacement)
         found = search.place(tips, force, lever)
         if found is None:
             continue
@@ -196,16 +198,37 @@ def find_drag(
     return "no posture of the hand presses on the object from above, clear of all else"
 
 
-def length_to_edge(object_: ShapedObject, centre: Float[Tensor, "3"], table: Plane) -> float:
-    """Return how far [m] the object must be dragged, so that its centre of mass is `DRAG.behind`
-    behind the edge.
+@dataclasses.dataclass(frozen=True)
+class Balance:
+    """Where the weight of an object acts, and how far the object may go over the table's edge.
 
-    It is negative if the centre is nearer to the edge, or beyond it. `centre` [m] is in the upright
-    frame.
+    Attributes:
+        centre: estimated centre of mass (3,) [m] in the upright frame.
+        edge: unit vector (3,) towards the edge in the upright frame.
+        away: distance [m] of the centre from the edge; negative if it is beyond the edge.
+        behind: distance [m] behind the edge at which the centre shall end.
     """
-    assert table.edge is not None
-    in_cloud = apply(object_.obj_from_upright, centre[None])[0]
-    return -float(table.edge.height(in_cloud)) - DRAG.behind
+
+    centre: Float[Tensor, "3"]
+    edge: Float[Tensor, "3"]
+    away: float
+    behind: float
+
+    @classmethod
+    def of(cls, object_: ShapedObject, table: Plane) -> "Balance":
+        """Return the balance of an object on a table with an edge, in the frame of the cloud."""
+        assert table.edge is not None
+        centre = centre_of_mass(object_)
+        edge = inverse(object_.obj_from_upright)[:3, :3] @ table.edge.normal.cpu().double()
+        in_cloud = apply(object_.obj_from_upright, centre[None])[0]
+        away = -float(table.edge.height(in_cloud))
+        reach = float(((object_.surface.vertices.cpu().double() - centre) @ edge).max())
+        return cls(centre, edge, away, max(DRAG.behind, DRAG.unsure * reach))
+
+    @property
+    def length(self) -> float:
+        """How far [m] towards the edge the object must be dragged; negative if it is there."""
+        return self.away - self.behind
 
 
 def pressing_force(mass: float, friction: float, table_friction: float) -> float | None:
@@ -239,15 +262,13 @@ def centre_of_mass(object_: ShapedObject) -> Float[Tensor, "3"]:
 class _Search:
     """The search for a pressing posture and its place on an object.
 
-    `centre` [m] is the centre of mass, the unit vector `edge` points to the table's edge, and `way`
-    [m] is the displacement of hand and object.
+    `way` [m] is the displacement of hand and object, in the upright frame.
     """
 
     object_: ShapedObject
     hand: Hand
     postures: PressPostures
-    centre: Float[Tensor, "3"]
-    edge: Float[Tensor, "3"]
+    balance: Balance
     way: Float[Tensor, "3"]
 
     def place(
@@ -263,7 +284,10 @@ class _Search:
         outward = unit(self.way)
         sideways = torch.stack([-outward[1], outward[0], torch.zeros_like(outward[0])])
         top = _Top(_facing_up(self.object_), outward)
-        places = top.places(self.centre, self.edge)
+        centre, edge = self.balance.centre, self.balance.edge
+        most = self.balance.behind - DRAG.supported
+        places = top.places(centre)
+        places = places[(places - centre) @ edge <= most][: DRAG.places]
         share = postures.presses.sum(1).double()
         able = flatnonzero(postures.strength >= force / share)
         angles = torch.arange(DRAG.turns, device="cpu").double() * (2 * math.pi / DRAG.turns)
@@ -274,18 +298,18 @@ class _Search:
         apart = _apart(postures.feet[rows], postures.presses[rows])
         turned = (turns @ postures.feet[rows][:, None].mT).mT  # (p, t, f, 3)
         for place in places:
-            off = abs(float((self.centre - place) @ sideways))
+            off = abs(float((centre - place) @ sideways))
             straight = lever * off <= apart
             if tips == 1:
                 straight = torch.full_like(straight, off <= DRAG.pivot)
             feet = turned + place
-            ahead = ((feet - self.centre) @ self.edge).where(presses, -math.inf).amax(2)
+            ahead = ((feet - centre) @ edge).where(presses, -math.inf).amax(2)
             height, flat = top.stand(feet)
             low = height.where(presses, math.inf).amin(2)
             high = height.where(presses, -math.inf).amax(2)
             good = straight[:, None] & steady[rows] & (flat | ~presses).all(2)
             good &= high - low <= DRAG.flat
-            good &= ahead <= DRAG.behind - DRAG.supported
+            good &= ahead <= most
             for p, t in torch.nonzero(good).tolist():
                 at = int(rows[p])
                 pose = rigid(turns[t], torch.stack([place[0], place[1], high[p, t]]))
@@ -405,12 +429,8 @@ class _Top:
         """Return the height [m] of the top below each of `feet` [m], and whether a tip can press."""
         return self._look(self.height, self.stands, feet[..., :2])
 
-    def places(self, centre: Float[Tensor, "3"], edge: Float[Tensor, "3"]) -> Float[Tensor, "k 3"]:
-        """Return places [m] on the top, far enough from the edge, those nearest to the `centre`
-        first.
-
-        `edge` is the unit vector towards the edge.
-        """
+    def places(self, centre: Float[Tensor, "3"]) -> Float[Tensor, "k 3"]:
+        """Return places [m] on the top, those nearest to the `centre` first."""
         cells = torch.round((self.nodes - centre[:2]) / DRAG.spacing)
         _, cell = torch.unique(cells, dim=0, return_inverse=True)
         count = torch.bincount(cell)
@@ -418,9 +438,8 @@ class _Top:
         # the mean of the nodes in each cell: on a narrow object it lies on its ridge
         places[:, :2].index_add_(0, cell, self.nodes)
         places = places / count[:, None]
-        places = places[(places - centre) @ edge <= DRAG.behind - DRAG.supported]
         distance = norm((places - centre)[:, :2])
-        return places[torch.argsort(distance, stable=True)][: DRAG.places]
+        return places[torch.argsort(distance, stable=True)]
 
 
 def _facing_up(object_: ShapedObject) -> Float[Tensor, "k 3 3"]:

@@ -25,10 +25,9 @@ from torchgrasp.ik.clearance import Obstacles
 from torchgrasp.planner.drag_plan import (
     DRAG,
     GRAVITY,
+    Balance,
     DragPlan,
-    centre_of_mass,
     find_drag,
-    length_to_edge,
 )
 from torchgrasp.planner.drag_text import with_drag
 from torchgrasp.planner.objects import ShapedObject
@@ -119,9 +118,11 @@ def plan_edge_grasps(
     >>> plan = plan_edge_grasps(load_object("cylinder"), load_hand("barrett"), spec, starts=8)
     """
     table = spec.plane
-    if table is None or table.edge is None:
+    edge = None if table is None else table.edge
+    if table is None or edge is None:
         found = "no table" if table is None else "a table without an edge"
         raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
+    table = table.to("cpu", torch.float64)
     sure = torch.tensor(DRAG.sure, dtype=torch.float64)
     friction = float(Distribution.of(spec.friction).quantile(sure))
     if not friction > table_friction:
@@ -131,20 +132,19 @@ def plan_edge_grasps(
     request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
     object_ = ShapedObject.of(request)
     shape = object_.shape.moved(object_.obj_from_upright)
-    centre = centre_of_mass(object_)
-    length = length_to_edge(object_, centre, table)
-    if length < -2 * DRAG.behind:
-        found = f"an edge {-1e3 * (length + DRAG.behind):.0f} mm behind the object's centre"
+    balance = Balance.of(object_, table)
+    if balance.away < -DRAG.behind:
+        found = f"an edge {-1e3 * balance.away:.0f} mm behind the object's centre"
         raise BadArgument("spec.table", found, "an edge beyond it")
     mass = Distribution.of(request.grasp_task.mass).most
-    load = _weight(mass, table, apply(object_.obj_from_upright, centre[None])[0])
+    load = _weight(mass, table, apply(object_.obj_from_upright, balance.centre[None])[0])
     request = dataclasses.replace(request, resist=load)
     drag = find_drag(object_, hand, table, mass, friction, table_friction)
     if isinstance(drag, str):
         return EdgePlan(None, plan_shaped(object_, request), shape, drag)
     # for the object, the edge comes nearer
     shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
-    nearer = dataclasses.replace(table, edge=table.edge.moved(inverse(shift)))
+    nearer = dataclasses.replace(table, edge=edge.moved(inverse(shift)))
     obstacles = _brought(object_, drag.displacement)
     object_ = dataclasses.replace(object_, table=nearer, obstacles=obstacles)
     grasps = plan_shaped(object_, request)

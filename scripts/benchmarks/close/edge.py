@@ -7,9 +7,11 @@ success are used. The corner is turned at random against body and camera.
 import dataclasses
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from paper.tables6_7 import format_points
 from train.household import household
 
 from benchmarks.close.table_lift import BASE
@@ -28,7 +30,7 @@ from torchgrasp import (
 )
 from torchgrasp.data.manifest import ObjectEntry, read_entries, read_object_mesh, read_view
 from torchgrasp.evaluation.drag_trial import EdgeLift, lift_from_edge
-from torchgrasp.evaluation.intervals import count_by, format_share, share_over
+from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import seed_of
 from torchgrasp.planner.edge import EdgePlan, plan_edge_grasps
 from torchgrasp.sim.convex_parts import convex_parts
@@ -45,31 +47,61 @@ LIMIT = 600.0
 """Limit [s] of the CPU time of one body."""
 
 
-@bench("headline/edge")
+class Outcome(NamedTuple):
+    """What came of one body: where it was grasped ("edge" or "table"), the number of tries that
+    raised it (0 for none), the same where it lies, and why it was lost.
+    """
+
+    where: str
+    tries: int
+    tries_there: int
+    why: str
+
+
+@bench("close/edge")
 def edge(o: Options) -> list[Row]:
     """Lift authored bodies that are 8 to 16 mm high, 0.1 m from a corner of their table."""
     count = o.times(LOW_BODIES)
     folder = o.out / f"edge_{count}"
     if not (folder / "manifest.json").is_file():
         household(folder, count, FIRST, HIGHEST)
-    return [_tried(o, folder, hand, bar) for hand, bar in LOW.items()]
+    return [_tried(o, folder, hand) for hand in o.hands]
 
 
-def _tried(o: Options, folder: Path, hand: str, bar: float) -> Row:
+def _tried(o: Options, folder: Path, hand: str) -> Row:
     """Return the row of one hand."""
     entries = {k: x for k, x in read_entries(folder).items() if isinstance(x, ObjectEntry)}
     tasks = [(folder, name, hand, o.seed, o.starts, o.simulator) for name in entries]
-    found = dict(zip(entries, run_all(lift_body, tasks, o.workers, LIMIT), strict=True))
+    found = {
+        name: Outcome(*x)
+        for name, x in zip(entries, run_all(lift_body, tasks, o.workers, LIMIT), strict=True)
+    }
     unit = {name: entry.family for name, entry in entries.items()}
-    risen = share_over(count_by((unit[k], tries > 0) for k, (_, tries, _, _) in found.items()))
-    first = share_over(count_by((unit[k], tries == 1) for k, (_, tries, _, _) in found.items()))
-    dragged = sum(where == "edge" for where, _, _, _ in found.values())
-    lost = {k: why for k, (_, tries, why, _) in found.items() if not tries}
+    risen, first, there = (
+        share_over(count_by((unit[k], good(x)) for k, x in found.items()))
+        for good in (
+            lambda x: x.tries > 0,
+            lambda x: x.tries == 1,
+            lambda x: x.tries_there > 0,
+        )
+    )
+    columns = [
+        count_by((unit[k], good > 0) for k, good in tries)
+        for tries in (
+            [(k, x.tries_there) for k, x in found.items()],
+            [(k, x.tries) for k, x in found.items()],
+        )
+    ]
+    gain = contrast_over(columns, (-1.0, 1.0))
+    dragged = sum(x.where == "edge" for x in found.values())
+    lost = {k: x.why for k, x in found.items() if not x.tries}
     words = f"up to three grasps {format_share(risen)}; the first {format_share(first)}; "
+    words += f"where they lie {format_share(there)}; gain {format_points(gain)}; "
     words += f"{dragged} of {len(found)} dragged to an edge"
     if lost:
         words += f"; lost {', '.join(f'{k} ({why})' for k, why in sorted(lost.items()))}"
-    numbers = {"hand": hand, "risen": risen, "first": first, "bodies": found}
+    numbers = {"hand": hand, "risen": risen, "first": first, "there": there, "bodies": found}
+    bar = LOW.get(hand, 0.0)
     what = f"{hand}, low bodies near a corner, {o.simulator}"
     row = Row(what, f">= {bar:.0%}", words, risen.value >= bar, numbers)
     print(row, flush=True)
@@ -78,35 +110,38 @@ def _tried(o: Options, folder: Path, hand: str, bar: float) -> Row:
 
 def lift_body(
     folder: Path, name: str, hand_name: str, seed: int, starts: int, simulator: Simulator
-) -> tuple[str, int, str, float]:
-    """Return where a body is grasped ("edge" or "table"), the number of tries that raised it (0 for
-    none), why it was lost, and the predicted success.
-    """
+) -> tuple[str, int, int, str]:
+    """Return the fields of the `Outcome` of a body."""
     trial = dataclasses.replace(BASE.trial, simulator=simulator)
     hand = load_hand(hand_name)
     mesh = read_object_mesh(folder, name)
+    parts = convex_parts(mesh)
     (view,) = read_entries(folder, (name,))[name].views  # pyright: ignore[reportAttributeAccessIssue]
     cloud = read_view(folder, name, view)
     own = seed_of(seed, name)
-    plans = [plan_here(cloud, hand, trial, starts, own)]
-    plans += [
-        plan_edge_grasps(
-            cloud,
-            hand,
-            ContactSpec(Distribution.of(trial.friction).mean, table=table),
-            starts,
-            own,
-            task=task_of(trial),
-            table_friction=trial.table_friction or 0.0,
-        )
-        for table in corner(mesh.bounds, own)
+    spec = ContactSpec(Distribution.of(trial.friction).mean)
+    given = {"task": task_of(trial), "table_friction": trial.table_friction or 0.0}
+    plans = [
+        plan_edge_grasps(cloud, hand, dataclasses.replace(spec, table=x), starts, own, **given)
+        for x in corner(mesh.bounds, own)
     ]
-    best = max(plans, key=lambda plan: plan.success)
-    where = "table" if best.drag is None else "edge"
-    if not best.grasps.status.eq(Status.OK).any():
-        return where, 0, "no grasp", math.nan
-    lift = lift_from_edge(best, hand, mesh, trial, own, tries=BASE.tries, parts=convex_parts(mesh))
-    return where, tries_to_rise(lift, trial), why_lost(lift), best.success
+    here = plan_here(cloud, hand, trial, starts, own)
+    best = max([*plans, here], key=certain)
+
+    def lift(plan: EdgePlan) -> tuple[int, str]:
+        if not plan.grasps.status.eq(Status.OK).any():
+            return 0, "no grasp"
+        found = lift_from_edge(plan, hand, mesh, trial, own, tries=BASE.tries, parts=parts)
+        return tries_to_rise(found, trial), why_lost(found)
+
+    tries, why = lift(best)
+    there = tries if best is here else lift(here)[0]
+    return "table" if best.drag is None else "edge", tries, there, why
+
+
+def certain(plan: EdgePlan) -> float:
+    """Return the predicted success of a plan; 0 if it is unknown."""
+    return 0.0 if math.isnan(plan.success) else plan.success
 
 
 def plan_here(cloud: PointCloud, hand: Hand, trial: TrialSpec, starts: int, seed: int) -> EdgePlan:
