@@ -111,18 +111,18 @@ def plan_edge_grasps(
         BadArgument: a friction of the fingertips that is not greater than `table_friction`.
 
     >>> import torch
-    >>> from torchgrasp import load_hand, load_object
-    >>> from torchgrasp.geometry import Plane
+    >>> from torchgrasp import Plane, load_hand, load_object
     >>> x = torch.tensor([1.0, 0, 0])
     >>> spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.2 * x, x))
     >>> plan = plan_edge_grasps(load_object("cylinder"), load_hand("barrett"), spec, starts=8)
     """
     table = spec.plane
-    edge = None if table is None else table.edge
-    if table is None or edge is None:
+    if table is None or table.edge is None:
         found = "no table" if table is None else "a table without an edge"
         raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
     table = table.to("cpu", torch.float64)
+    edge = table.edge
+    assert edge is not None
     sure = torch.tensor(DRAG.sure, dtype=torch.float64)
     friction = float(Distribution.of(spec.friction).quantile(sure))
     if not friction > table_friction:
