@@ -213,7 +213,10 @@ def run_on_cluster(
                     found = f"{address!r}, which ended during the work"
                     allowed = "a scheduler that goes on; the same call continues"
                     raise BadArgument("workers", found, allowed) from error
-                del future  # results that were yielded leave the memory
+                # a result that was yielded leaves the memory, whatever else holds its future, as
+                # the traceback of a worker that died may
+                future.release()
+                del future
                 submit(1)
                 yield number, result
         finally:
