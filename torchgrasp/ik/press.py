@@ -137,7 +137,8 @@ def _search(hand: Hand, seed: int) -> PressPostures:
     row = flatnonzero(best > -math.inf)
     row = row[torch.argsort(best[row], descending=True, stable=True)]
     at = at[row]
-    joints, presses = joints[row], presses[row, at]
+    joints = joints[row]
+    presses = presses[row, at]
     down = _levelled(centres[row], radius, directions[at], presses)
     row = flatnonzero(_gap(hand, joints, down, presses) > PRESS.gap)
     return _built(hand, joints[row], down[row], presses[row])

@@ -153,7 +153,7 @@ def find_drag(
         table_friction: coefficient of friction between object and table.
     """
     assert table.edge is not None
-    balance = Balance.of(object_, table)
+    balance = EdgeBalance.of(object_, table)
     length = balance.length
     if length <= DRAG.shortest:
         return "the object hangs over the edge as far as it can"
@@ -178,7 +178,7 @@ def find_drag(
         return "a neighbour is in the object's way to the edge"
     # two tips resist a turn of the object; a narrow one would roll unless it is dragged along
     for tips, displacement in itertools.product((2, 1), ways):
-        search = _Search(object_, hand, postures, balance, turned @ displacement)
+        search = _PressSearch(object_, hand, postures, balance, turned @ displacement)
         found = search.place(tips, force, lever)
         if found is None:
             continue
@@ -199,7 +199,7 @@ def find_drag(
 
 
 @dataclasses.dataclass(frozen=True)
-class Balance:
+class EdgeBalance:
     """Where the weight of an object acts, and how far the object may go over the table's edge.
 
     Attributes:
@@ -215,7 +215,7 @@ class Balance:
     behind: float
 
     @classmethod
-    def of(cls, object_: ShapedObject, table: Plane) -> "Balance":
+    def of(cls, object_: ShapedObject, table: Plane) -> "EdgeBalance":
         """Return the balance of an object on a table with an edge, in the frame of the cloud."""
         assert table.edge is not None
         centre = centre_of_mass(object_)
@@ -259,7 +259,7 @@ def centre_of_mass(object_: ShapedObject) -> Float[Tensor, "3"]:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Search:
+class _PressSearch:
     """The search for a pressing posture and its place on an object.
 
     `way` [m] is the displacement of hand and object, in the upright frame.
@@ -268,7 +268,7 @@ class _Search:
     object_: ShapedObject
     hand: Hand
     postures: PressPostures
-    balance: Balance
+    balance: EdgeBalance
     way: Float[Tensor, "3"]
 
     def place(
@@ -284,7 +284,8 @@ class _Search:
         outward = unit(self.way)
         sideways = torch.stack([-outward[1], outward[0], torch.zeros_like(outward[0])])
         top = _Top(_facing_up(self.object_), outward)
-        centre, edge = self.balance.centre, self.balance.edge
+        centre = self.balance.centre
+        edge = self.balance.edge
         most = self.balance.behind - DRAG.supported
         places = top.places(centre)
         places = places[(places - centre) @ edge <= most][: DRAG.places]
@@ -331,7 +332,8 @@ class _Search:
         # under a handle, say, a tip would have to go through the object
         if _gap(self.object_.body.field, centres[tips], radius[tips]) < -DRAG.sunk:
             return False
-        centres, radius = centres[~tips], radius[~tips]
+        centres = centres[~tips]
+        radius = radius[~tips]
         if float((centres[:, 2] - radius).min()) < DRAG.clear:
             return False
         heights = torch.linspace(0, DRAG.approach, DRAG.lowered, dtype=torch.float64, device="cpu")
@@ -367,8 +369,10 @@ def _is_steady(postures: PressPostures, ways: Float[Tensor, "t 3"]) -> Bool[Tens
 
 def _turns(angles: Float[Tensor, "t"]) -> Float[Tensor, "t 3 3"]:
     """Return the rotations about the vertical by `angles` [rad]."""
-    cosine, sine = torch.cos(angles), torch.sin(angles)
-    zero, one = torch.zeros_like(angles), torch.ones_like(angles)
+    cosine = torch.cos(angles)
+    sine = torch.sin(angles)
+    zero = torch.zeros_like(angles)
+    one = torch.ones_like(angles)
     rows = [cosine, -sine, zero, sine, cosine, zero, zero, zero, one]
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 

@@ -25,8 +25,8 @@ from torchgrasp.ik.clearance import Obstacles
 from torchgrasp.planner.drag_plan import (
     DRAG,
     GRAVITY,
-    Balance,
     DragPlan,
+    EdgeBalance,
     find_drag,
 )
 from torchgrasp.planner.drag_text import with_drag
@@ -132,7 +132,7 @@ def plan_edge_grasps(
     request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
     object_ = ShapedObject.of(request)
     shape = object_.shape.moved(object_.obj_from_upright)
-    balance = Balance.of(object_, table)
+    balance = EdgeBalance.of(object_, table)
     if balance.away < -DRAG.behind:
         found = f"an edge {-1e3 * balance.away:.0f} mm behind the object's centre"
         raise BadArgument("spec.table", found, "an edge beyond it")

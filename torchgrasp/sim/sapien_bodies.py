@@ -105,7 +105,8 @@ def table(sapien: Any, physx: Any, material: Any, spec: SceneSpec) -> Any:
     else:
         ledge = spec.ledge
         box = trimesh.creation.box(2 * ledge.half)
-        corners, faces = box.vertices.astype(np.float32), box.faces.astype(np.uint32)
+        corners = box.vertices.astype(np.float32)
+        faces = box.faces.astype(np.uint32)
         scale = np.ones(3, np.float32)
         top = physx.PhysxCollisionShapeTriangleMesh(corners, faces, scale, material)
         frame = np.eye(4)

@@ -283,7 +283,8 @@ class Grasp(ForPrograms):
                 edge = self._plan_drag(cloud, hand, spec, grasps, progress)
             drag = None if edge is None else edge.drag
             if edge is not None and drag is not None:
-                grasps, shape = edge.grasps, edge.shape
+                grasps = edge.grasps
+                shape = edge.shape
                 progress.values["plan"] = None  # the contacts where the object stood
                 cloud = move(cloud, rigid(torch.eye(3), drag.displacement).to(cloud.points))
             run = self._gather(name, path, cloud, hand, spec, grasps, shape, progress, explanation)
