@@ -18,7 +18,6 @@ from torchgrasp.geometry.plane import move
 from torchgrasp.ik.press import press_postures
 from torchgrasp.planner.drag_plan import (
     DRAG,
-    GRAVITY,
     DragPlan,
     _is_steady,
     _Top,
@@ -29,6 +28,7 @@ from torchgrasp.planner.edge import _brought, plan_edge_grasps
 from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
 from torchgrasp.shape.surface import extract_mesh
+from torchgrasp.success.task import TASKS
 from torchgrasp.values.distribution import Distribution
 
 HANDS = ["allegro", "barrett"]
@@ -137,9 +137,9 @@ def test_grasps_are_of_the_object_where_the_drag_leaves_it(found):
 def test_the_pressing_force_moves_the_object_by_coulombs_law(friction, table, mass):
     force = pressing_force(mass, friction, table)
     pressed = torch.linspace(0.0, 100.0, 1_000_001).double()
-    moves = friction * pressed > table * (pressed + mass * GRAVITY)
+    moves = friction * pressed > table * (pressed + mass * TASKS.gravity)
     least = float(pressed[moves].min())
-    wanted = max(DRAG.reserve * least, DRAG.weights * mass * GRAVITY, DRAG.least)
+    wanted = max(DRAG.reserve * least, DRAG.weights * mass * TASKS.gravity, DRAG.least)
     wanted = min(wanted, DRAG.most)
     if DRAG.enough * least > DRAG.most:
         assert force is None
@@ -285,7 +285,7 @@ def test_postures_that_press_steadily_drag_and_do_not_slip():
     ways = torch.stack([angle.cos(), angle.sin(), torch.zeros(6).double()], 1)
     steady = _is_steady(postures, ways)
     pressed = pressing_force(dragged.MASS, FRICTION, TABLE_FRICTION)
-    weight = dragged.MASS * GRAVITY
+    weight = dragged.MASS * TASKS.gravity
     unsteady = 0
     for p, t in ((p, t) for p in range(0, len(postures), 8) for t in range(len(ways))):
         fingers = torch.nonzero(postures.presses[p])[:, 0].tolist()
@@ -307,10 +307,10 @@ def test_a_top_is_flat_inside_its_outline_in_a_mesh_of_any_fineness():
         here = torch.cat([here, torch.full_like(here[..., :1], 0.02)], -1)
         one = torch.stack([here[:-1, :-1], here[1:, :-1], here[1:, 1:]], -2).flatten(0, 1)
         two = torch.stack([here[:-1, :-1], here[1:, 1:], here[:-1, 1:]], -2).flatten(0, 1)
-        top = _Top(torch.cat([one, two]), OUTWARD)
+        top = _Top(torch.cat([one, two]))
         places = 2 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)).double() - 1
         places = places * real([0.2, 0.15, 0.0])
-        height, flat = top.stand(places)
+        height, flat = top.look(top.stands(OUTWARD), places[:, :2])
         near(height, torch.full_like(height, 0.02), 1e-12)
         inside = (places.abs()[:, :2] < real([0.15, 0.1]) - 0.01).all(1)
         outside = (places.abs()[:, :2] > real([0.15, 0.1]) + 0.003).any(1)
@@ -318,4 +318,5 @@ def test_a_top_is_flat_inside_its_outline_in_a_mesh_of_any_fineness():
         assert not bool(flat[outside].any())
     assert BOX.is_watertight
     step = torch.cat([one, two + real([0.0, 0.0, DRAG.flat + 1e-3])])
-    assert not bool(_Top(step, OUTWARD).stand(real([[0.0, 0.0, 0.0]]))[1].any())
+    top = _Top(step)
+    assert not bool(top.look(top.stands(OUTWARD), real([[0.0, 0.0]]))[1].any())

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Seed
-from torchgrasp.geometry.frames import rigid
+from torchgrasp.geometry.frames import inverse, rigid
 from torchgrasp.geometry.linalg import across, eye_like, fibonacci_sphere, norm, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.sample import sample_configurations
@@ -211,7 +211,7 @@ def _built(
     share = presses.to(feet) / presses.sum(1, keepdim=True)
     origin = (share[..., None] * feet).sum(1)
     first, second = across(down)
-    press_from_hand = torch.linalg.inv(rigid(torch.stack([second, first, -down], -1), origin))
+    press_from_hand = inverse(rigid(torch.stack([second, first, -down], -1), origin))
     turn = press_from_hand[:, :3, :3]
     shift = press_from_hand[:, None, :3, 3]
     spheres = hand.sphere_centres(joints)

@@ -26,8 +26,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.press import PressPostures, press_postures
 from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.scene.occupancy import OCCUPANCY
-
-GRAVITY = 9.81  # acceleration [m/s^2]
+from torchgrasp.success.task import TASKS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,7 +162,7 @@ def find_drag(
     if object_.scene is not None and length > OCCUPANCY.sideways:
         return f"the camera's scene is known only {OCCUPANCY.sideways:g} m around the object"
     # the torque of the weight's friction, over the friction that is left to two tips
-    lever = 2 * table_friction * mass * GRAVITY / (DRAG.share * friction * force)
+    lever = 2 * table_friction * mass * TASKS.gravity / (DRAG.share * friction * force)
     postures = press_postures(hand)
     hand = hand.to("cpu", torch.float64)
     frame = object_.obj_from_upright
@@ -176,9 +175,10 @@ def find_drag(
     ways = [way for way in ways if _is_free(object_, turned @ way)]
     if not ways:
         return "a neighbour is in the object's way to the edge"
+    top = _Top(_facing_up(object_))
+    searches = [_PressSearch(object_, hand, postures, balance, top, turned @ way) for way in ways]
     # two tips resist a turn of the object; a narrow one would roll unless it is dragged along
-    for tips, displacement in itertools.product((2, 1), ways):
-        search = _PressSearch(object_, hand, postures, balance, turned @ displacement)
+    for tips, (search, displacement) in itertools.product((2, 1), zip(searches, ways, strict=True)):
         found = search.place(tips, force, lever)
         if found is None:
             continue
@@ -238,7 +238,7 @@ def pressing_force(mass: float, friction: float, table_friction: float) -> float
     A force N moves it if the fingers' friction N is at least the table's friction times N plus the
     weight.
     """
-    weight = mass * GRAVITY
+    weight = mass * TASKS.gravity
     least = table_friction * weight / (friction - table_friction)
     if DRAG.enough * least > DRAG.most:
         return None
@@ -269,6 +269,7 @@ class _PressSearch:
     hand: Hand
     postures: PressPostures
     balance: EdgeBalance
+    top: "_Top"
     way: Float[Tensor, "3"]
 
     def place(
@@ -283,11 +284,11 @@ class _PressSearch:
         postures = self.postures
         outward = unit(self.way)
         sideways = torch.stack([-outward[1], outward[0], torch.zeros_like(outward[0])])
-        top = _Top(_facing_up(self.object_), outward)
+        stands = self.top.stands(outward)
         centre = self.balance.centre
         edge = self.balance.edge
         most = self.balance.behind - DRAG.supported
-        places = top.places(centre)
+        places = self.top.places(stands, centre)
         places = places[(places - centre) @ edge <= most][: DRAG.places]
         share = postures.presses.sum(1).double()
         able = flatnonzero(postures.strength >= force / share)
@@ -305,7 +306,7 @@ class _PressSearch:
                 straight = torch.full_like(straight, off <= DRAG.pivot)
             feet = turned + place
             ahead = ((feet - centre) @ edge).where(presses, -math.inf).amax(2)
-            height, flat = top.stand(feet)
+            height, flat = self.top.look(stands, feet[..., :2])
             low = height.where(presses, math.inf).amin(2)
             high = height.where(presses, -math.inf).amax(2)
             good = straight[:, None] & steady[rows] & (flat | ~presses).all(2)
@@ -382,14 +383,14 @@ class _Top:
 
     Args:
         corners: those of the triangles (k, 3, 3) [m] of the surface that face up.
-        outward: unit vector along which the object is dragged.
 
     Attributes:
+        nodes: the nodes (n, m, 2) [m] of the grid.
         height: height (n, m) [m] of the top at each node.
-        stands: whether a tip can press at each node (n, m): the top is flat around it.
+        seen: whether the top is at each node (n, m).
     """
 
-    def __init__(self, corners: Float[Tensor, "k 3 3"], outward: Float[Tensor, "3"]) -> None:
+    def __init__(self, corners: Float[Tensor, "k 3 3"]) -> None:
         from scipy.spatial import KDTree
 
         # points all over the triangles
@@ -399,48 +400,49 @@ class _Top:
         points = torch.from_numpy(dense)
         margin = DRAG.rim + DRAG.support + DRAG.cell
         self.low = points[:, :2].amin(0) - margin
-        n, m = ((points[:, :2].amax(0) + margin - self.low) / DRAG.cell).ceil().long().tolist()
-        steps = torch.cartesian_prod(
-            torch.arange(n + 1, device="cpu"), torch.arange(m + 1, device="cpu")
-        ).double()
-        nodes = self.low + DRAG.cell * steps
-        gap, index = KDTree(points[:, :2].numpy()).query(nodes.numpy())
-        index = torch.from_numpy(index)
-        self.height = points[index, 2].view(n + 1, m + 1)
-        seen = (torch.from_numpy(gap) <= DRAG.near).view(n + 1, m + 1)
+        size = ((points[:, :2].amax(0) + margin - self.low) / DRAG.cell).ceil().long() + 1
+        steps = [torch.arange(int(count), device="cpu").double() for count in size]
+        self.nodes = self.low + DRAG.cell * torch.stack(torch.meshgrid(*steps, indexing="ij"), -1)
+        gap, index = KDTree(points[:, :2].numpy()).query(self.nodes.numpy())
+        self.height = points[torch.from_numpy(index), 2]
+        self.seen = torch.from_numpy(gap) <= DRAG.near
+
+    def look(
+        self, good: Bool[Tensor, "n m"], places: Float[Tensor, "*b 2"]
+    ) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
+        """Return the height [m] of the top at the nodes nearest to `places` [m], and the map `good`
+        there; beyond the maps nothing is good.
+        """
+        index = ((places - self.low) / DRAG.cell).round().long()
+        size = torch.tensor(good.shape, device="cpu")
+        inside = ((index >= 0) & (index < size)).all(-1)
+        row, column = torch.where(inside[..., None], index, 0).unbind(-1)
+        return self.height[row, column], good[row, column] & inside
+
+    def stands(self, outward: Float[Tensor, "3"]) -> Bool[Tensor, "n m"]:
+        """Return whether a tip that drags along the unit vector `outward` can press at each node:
+        the top is flat around it.
+        """
         angles = torch.arange(DRAG.ring, device="cpu").double() * (2 * math.pi / DRAG.ring)
         ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
         # before and behind the tip the top must reach farther
         along = DRAG.support * torch.stack([outward[:2], -outward[:2]])
         around = torch.cat([ring.new_zeros(1, 2), ring, along])
-        height, seen = self._look(self.height, seen, nodes[:, None] + around)
-        low, high = height.aminmax(dim=1)
-        flat = seen.all(1) & (high - low <= DRAG.flat)
-        self.stands = flat.view(n + 1, m + 1)
-        self.nodes = nodes[flat]
+        height, seen = self.look(self.seen, self.nodes[..., None, :] + around)
+        low, high = height.aminmax(dim=-1)
+        return seen.all(-1) & (high - low <= DRAG.flat)
 
-    def _look(
-        self, height: Float[Tensor, "n m"], good: Bool[Tensor, "n m"], places: Float[Tensor, "*b 2"]
-    ) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
-        """Return both maps at the nodes nearest to `places` [m]; beyond the maps nothing is good."""
-        index = ((places - self.low) / DRAG.cell).round().long()
-        size = torch.tensor(height.shape, device="cpu")
-        inside = ((index >= 0) & (index < size)).all(-1)
-        row, column = torch.where(inside[..., None], index, 0).unbind(-1)
-        return height[row, column], good[row, column] & inside
-
-    def stand(self, feet: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
-        """Return the height [m] of the top below each of `feet` [m], and whether a tip can press."""
-        return self._look(self.height, self.stands, feet[..., :2])
-
-    def places(self, centre: Float[Tensor, "3"]) -> Float[Tensor, "k 3"]:
-        """Return places [m] on the top, those nearest to the `centre` first."""
-        cells = torch.round((self.nodes - centre[:2]) / DRAG.spacing)
+    def places(
+        self, stands: Bool[Tensor, "n m"], centre: Float[Tensor, "3"]
+    ) -> Float[Tensor, "k 3"]:
+        """Return places [m] where a tip `stands`, those nearest to the `centre` first."""
+        nodes = self.nodes[stands]
+        cells = torch.round((nodes - centre[:2]) / DRAG.spacing)
         _, cell = torch.unique(cells, dim=0, return_inverse=True)
         count = torch.bincount(cell)
         places = torch.zeros(len(count), 3, dtype=torch.float64, device="cpu")
         # the mean of the nodes in each cell: on a narrow object it lies on its ridge
-        places[:, :2].index_add_(0, cell, self.nodes)
+        places[:, :2].index_add_(0, cell, nodes)
         places = places / count[:, None]
         distance = norm((places - centre)[:, :2])
         return places[torch.argsort(distance, stable=True)]

@@ -24,7 +24,6 @@ from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.clearance import Obstacles
 from torchgrasp.planner.drag_plan import (
     DRAG,
-    GRAVITY,
     DragPlan,
     EdgeBalance,
     find_drag,
@@ -34,7 +33,7 @@ from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.run import plan_shaped
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.success.task import GraspTask, TaskWrenches
+from torchgrasp.success.task import TASKS, GraspTask, TaskWrenches
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ContactSpec
@@ -131,17 +130,17 @@ def plan_edge_grasps(
     hand = as_hand(hand, "hand")
     request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
     object_ = ShapedObject.of(request)
-    shape = object_.shape.moved(object_.obj_from_upright)
+    frame = object_.obj_from_upright
     balance = EdgeBalance.of(object_, table)
     if balance.away < -DRAG.behind:
         found = f"an edge {-1e3 * balance.away:.0f} mm behind the object's centre"
         raise BadArgument("spec.table", found, "an edge beyond it")
     mass = Distribution.of(request.grasp_task.mass).most
-    load = _weight(mass, table, apply(object_.obj_from_upright, balance.centre[None])[0])
+    load = _weight(mass, table, apply(frame, balance.centre[None])[0])
     request = dataclasses.replace(request, resist=load)
     drag = find_drag(object_, hand, table, mass, friction, table_friction)
     if isinstance(drag, str):
-        return EdgePlan(None, plan_shaped(object_, request), shape, drag)
+        return EdgePlan(None, plan_shaped(object_, request), object_.shape.moved(frame), drag)
     # for the object, the edge comes nearer
     shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
     nearer = dataclasses.replace(table, edge=edge.moved(inverse(shift)))
@@ -150,7 +149,7 @@ def plan_edge_grasps(
     grasps = plan_shaped(object_, request)
     grasps = move(grasps, shift)
     grasps = dataclasses.replace(grasps, meta={**grasps.meta, "table": table.describe()})
-    return EdgePlan(drag, with_drag(grasps, drag), shape.moved(shift))
+    return EdgePlan(drag, with_drag(grasps, drag), object_.shape.moved(shift @ frame))
 
 
 def _weight(mass: float, table: Plane, centre: Float[Tensor, "3"]) -> TaskWrenches:
@@ -159,7 +158,7 @@ def _weight(mass: float, table: Plane, centre: Float[Tensor, "3"]) -> TaskWrench
 
     The hand grasps the object beside its centre of mass, so that its weight would turn it.
     """
-    force = -DRAG.carried * mass * GRAVITY * table.normal.double()
+    force = -DRAG.carried * mass * TASKS.gravity * table.normal.double()
     return TaskWrenches(torch.cat([force, torch.zeros_like(force)])[None], centre)
 
 
