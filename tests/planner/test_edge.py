@@ -1,5 +1,6 @@
 """Drags of a low box to the edge of its table, and the grasps there, against oracles of their own."""
 
+import dataclasses
 import functools
 
 import pytest
@@ -27,7 +28,7 @@ from torchgrasp.planner.drag_plan import (
 from torchgrasp.planner.edge import _brought, plan_edge_grasps
 from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
-from torchgrasp.shape.surface import extract_mesh
+from torchgrasp.shape.surface import Mesh, extract_mesh
 from torchgrasp.success.task import TASKS
 from torchgrasp.values.distribution import Distribution
 
@@ -201,6 +202,16 @@ def test_objects_that_need_no_drag_or_allow_none_have_a_reason():
     near(hanging.shape.center[:2], torch.zeros(2).double(), 5e-3)
     heavy = quick(task=GraspTask(5.0), starts=1)
     assert heavy.drag is None and "5 kg" in heavy.reason
+
+
+def test_an_object_without_a_level_top_has_no_place_to_press():
+    hand = load_hand("barrett")
+    spec = ContactSpec(FRICTION, table=ending(DISTANCE))
+    cone = trimesh.creation.cone(0.03, 0.06)
+    surface = Mesh(torch.from_numpy(cone.vertices.copy()), torch.from_numpy(cone.faces.copy()))
+    object_ = dataclasses.replace(ShapedObject.of(Request(VIEW, hand, spec)), surface=surface)
+    rest = dragged.MASS, FRICTION, TABLE_FRICTION
+    assert "no posture" in find_drag(object_, hand, ending(DISTANCE), *rest)
 
 
 def test_arguments_that_cannot_be_are_refused():

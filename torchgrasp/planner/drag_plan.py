@@ -175,7 +175,11 @@ def find_drag(
     ways = [way for way in ways if _is_free(object_, turned @ way)]
     if not ways:
         return "a neighbour is in the object's way to the edge"
-    top = _Top(_facing_up(object_))
+    no_posture = "no posture of the hand presses on the object from above, clear of all else"
+    corners = _facing_up(object_)
+    if not len(corners):
+        return no_posture
+    top = _Top(corners)
     searches = [_PressSearch(object_, hand, postures, balance, top, turned @ way) for way in ways]
     # two tips resist a turn of the object; a narrow one would roll unless it is dragged along
     for tips, (search, displacement) in itertools.product((2, 1), zip(searches, ways, strict=True)):
@@ -195,7 +199,7 @@ def find_drag(
             force=force,
             table=table,
         )
-    return "no posture of the hand presses on the object from above, clear of all else"
+    return no_posture
 
 
 @dataclasses.dataclass(frozen=True)
