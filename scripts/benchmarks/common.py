@@ -189,6 +189,16 @@ def keep(path: Path, make: Callable[[], Any]) -> Any:
     return json.loads(path.read_text("utf-8"))
 
 
+def keep_at_commit(options: Options, name: str) -> Path | None:
+    """Return the folder in `out` for results of a bench that hold at this commit alone.
+
+    None while the working tree has changes, or without git: then nothing is kept.
+    """
+    commit = describe_commit()
+    fixed = CHANGED not in commit and commit != UNKNOWN
+    return options.out / name / commit if fixed else None
+
+
 CHOICES = ("only", "out", "publish", "workers")
 """Options that change no row."""
 
@@ -248,8 +258,8 @@ def format_rows(rows: Iterable[Row]) -> list[str]:
     return lines
 
 
-def describe_run(threads: int) -> str:
-    """Return commit, processor, threads and version of torch in one line."""
+def describe_commit() -> str:
+    """Return the short name of the commit, and whether the working tree has changes."""
 
     def git(*words: str) -> str:
         return subprocess.run(
@@ -259,11 +269,19 @@ def describe_run(threads: int) -> str:
     commit = git("rev-parse", "--short", "HEAD") or UNKNOWN
     if git("status", "--short"):
         commit += CHANGED
+    return commit
+
+
+def describe_run(threads: int) -> str:
+    """Return commit, processor, threads and version of torch in one line."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     processor = names[0] if names else platform.processor() or platform.machine()
-    return f"Commit {commit}; {processor}, {os.cpu_count()} cores; {threads} threads; torch {torch.__version__}."
+    return (
+        f"Commit {describe_commit()}; {processor}, {os.cpu_count()} cores; {threads} threads; "
+        f"torch {torch.__version__}."
+    )
 
 
 def timed(

@@ -10,6 +10,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -22,7 +23,17 @@ from train.household import (
     family_of,
 )
 
-from benchmarks.common import Options, Row, bench, format_number, mean_over, run_all, sum_by
+from benchmarks.common import (
+    Options,
+    Row,
+    bench,
+    format_number,
+    keep,
+    keep_at_commit,
+    mean_over,
+    run_all,
+    sum_by,
+)
 from torchgrasp import ContactSpec, Distribution, GraspTask, load_hand, plan_grasps
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.evaluation.intervals import Share, contrast_over
@@ -92,11 +103,13 @@ class Outcome(NamedTuple):
 @bench("plan/uncertain")
 def uncertain(o: Options) -> list[Row]:
     """Lift the best grasp of each rule at quantiles of the friction; predictions know all of it."""
-    tasks = [(k, o.hands[0], o.seed, setting) for k, setting in choose_bodies(o.times(BODIES))]
+    folder = keep_at_commit(o, "uncertain")
+    chosen = choose_bodies(o.times(BODIES))
+    tasks = [(folder, k, o.hands[0], o.seed, setting) for k, setting in chosen]
     found = list[Outcome]()
-    for outcomes in run_all(try_body, tasks, o.workers, LIMIT):
+    for outcomes in run_all(kept_body, tasks, o.workers, LIMIT):
         print(*outcomes, sep="\n", flush=True)
-        found += [Outcome(*outcome) for outcome in outcomes]
+        found += [Outcome(*map(_number, outcome)) for outcome in outcomes]
     return describe(found)
 
 
@@ -117,6 +130,25 @@ def see_body(k: int) -> tuple[HouseholdBody, PointCloud]:
     body = author_household(k)
     eye = look_at(GOLDEN_ANGLE * k % 360, 35.0, target=body.mesh)
     return body, partial_view(body.mesh, eye, noise=True, seed=k)
+
+
+def _number(value: Any) -> Any:
+    """Return a value of a kept outcome, where NaN was written as null."""
+    return math.nan if value is None else value
+
+
+def kept_body(
+    folder: Path | None, k: int, hand: str, seed: int, setting: tuple[str, float]
+) -> list[Any]:
+    """Return the fields of the outcomes of body `k`; those of a stopped run are read.
+
+    They are kept in `folder`; without one all is measured.
+    """
+    if folder is None:
+        return try_body(k, hand, seed, setting)
+    simulator, mass = setting
+    path = folder / f"{hand}_{k}_{seed}_{simulator}_{mass}.json"
+    return keep(path, lambda: try_body(k, hand, seed, setting))
 
 
 def try_body(k: int, hand: str, seed: int, setting: tuple[str, float]) -> list[tuple[Any, ...]]:
