@@ -14,7 +14,7 @@ from torch import Tensor
 from torchgrasp.cloud.agreement import check_contacts, check_stand
 from torchgrasp.control.reference import check_single
 from torchgrasp.control.regrasp import smooth_step
-from torchgrasp.data.shipped import GraspObject
+from torchgrasp.data.shipped import GraspObject, solid_of
 from torchgrasp.evaluation.criterion import Tick, judge_lift, motion_between
 from torchgrasp.evaluation.trial import (
     TRIALS,
@@ -31,7 +31,6 @@ from torchgrasp.foundation.rules import Pose, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import norm
-from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
@@ -130,10 +129,7 @@ def close_hand(
     torch.Size([3, 3])
     """
     check_single(grasp)
-    if isinstance(mesh, GraspObject):
-        parts = mesh.parts if parts is None else parts
-        mesh = mesh.mesh
-    mesh = read_mesh(mesh)
+    mesh, parts = solid_of(mesh, parts)
     hand = hand if isinstance(hand, Hand) else hand_of(grasp, hand)
     check_contacts(grasp, mesh, TRIALS.slack)
     if table is not None:

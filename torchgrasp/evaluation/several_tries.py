@@ -20,7 +20,7 @@ from torchgrasp.evaluation.trial import (
     TrialRun,
     Truth,
     check_truth,
-    level_table,
+    true_table,
 )
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
@@ -170,7 +170,7 @@ def _left_behind(
     planned = trial.grasp.obj_from_hand[0].to("cpu", torch.float64)
     true = apply_error(planned, truth.error)
     error = inverse(following) @ true @ felt @ inverse(planned) @ following
-    table = level_table(trial.grasp, truth) if truth.table is None else truth.table
+    table = true_table(trial.grasp, truth)
     bodies = Neighbour(read_mesh(truth.mesh), truth.parts), *truth.neighbours
     poses = result.object_pose[-1], *result.disturbance.neighbour_pose[-1]
     target, *others = (_moved(body, pose.numpy()) for body, pose in zip(bodies, poses, strict=True))
