@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.data.shards import MOST, JobRow, Shard, load_shard, read_row
+from torchgrasp.data.shards import MOST, JobRow, Shard, load_shard, read_row, shard_ranges
 from torchgrasp.files import Recent, read_json
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import ModelFileError
@@ -199,7 +199,8 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     fields["campaign"].text()
     jobs = tuple(read_row(row, bare=True) for row in fields["jobs"].items(MOST))
     size = fields["jobs_in_shard"].whole(1, MOST)
-    lacking = sum(not shard_path(folder, k).is_file() for k in range(-(-len(jobs) // size)))
+    shards = range(len(shard_ranges(len(jobs), size)))
+    lacking = sum(not shard_path(folder, k).is_file() for k in shards)
     if lacking:
         found = f"{folder} without {lacking} of its shards"
         raise refuse(found, "all shards: run the campaign again")
