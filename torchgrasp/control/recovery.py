@@ -22,7 +22,7 @@ from torchgrasp.control.tactile import EARLY, Observation, smooth
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.linalg import limit_norm, unit
+from torchgrasp.geometry.linalg import limit_norm, norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.closing import ClosingOptions
 from torchgrasp.values.distribution import Distribution
@@ -250,7 +250,7 @@ class GuardedApproach:
         self.displacement = displacement
         shift = palm_goal(displacement[:3], self.reference.table, self.options.palm_reach)
         self.goal = self.reference.rise + shift
-        way = float(torch.linalg.vector_norm(self.goal - self.palm))
+        way = float(norm(self.goal - self.palm))
         self.retreat = max(self.retreat, min(self.left + way, self.length))
 
 
@@ -317,7 +317,7 @@ class GraspCheck:
         touches = self.touches
         if not bool((touches.contact | ~touches.known).all()):
             return False
-        if float(torch.linalg.vector_norm(self.displacement[:3] - self.palm)) > CHECK.misplaced:
+        if float(norm(self.displacement[:3] - self.palm)) > CHECK.misplaced:
             return False
         if not bool(touches.felt.all()):
             # without all places of contacts the forces cannot be judged
@@ -466,6 +466,6 @@ def next_palm(
     """
     way = goal - palm
     longest = PALM_SPEED * period
-    if float(torch.linalg.vector_norm(way)) <= longest:
+    if float(norm(way)) <= longest:
         return goal
     return palm + limit_norm(way, longest)

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchgrasp.cloud.agreement import AGREEMENT, check_contacts
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.control.controller import GraspController
+from torchgrasp.control.finger_forces import drive_efforts
 from torchgrasp.control.holding import GripHold
 from torchgrasp.control.modes import choose_preference
 from torchgrasp.control.recovery import can_guard
@@ -426,7 +427,5 @@ class TrialRun:
         hold = self.controller.hold
         if isinstance(hold, GripHold):
             return hold.strained
-        hand = reference.hand
-        effort = reference.kp.new_tensor([hand.actuators[x].effort for x in hand.tree.joint_names])
         off = (self.controller.targets.joints - self.observation.joints).abs()
-        return bool((reference.kp * off >= effort).any())
+        return bool((reference.kp * off >= drive_efforts(reference.hand)).any())
