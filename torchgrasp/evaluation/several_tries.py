@@ -126,11 +126,11 @@ class _CheckedLift(_Lift):
         failed = alone and self.attempt.fails(self.run.observation, height, period)
         return failed or super()._gives_up(height)
 
-    def _put_down(self, time: float, rising: float) -> Status:
+    def _put_down(self, elapsed: float, rising: float) -> Status:
         """Lower the hand, open it, withdraw it and let the object come to rest; return why the lift
         failed.
         """
-        status = super()._put_down(time, rising)
+        status = super()._put_down(elapsed, rising)
         run = self.run
         withdrawal = self.attempt.withdraw(run.observation, run.robot.period, self.spec.approach)
         for targets in withdrawal:
