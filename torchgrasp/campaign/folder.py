@@ -178,9 +178,9 @@ class _Store:
         """
         shard = load_shard(path, self.campaign.meta)
         held = [(row.object, row.view) for row in shard.rows]
-        if held != (
-            asked := [(self.campaign.rows[j].object, self.campaign.rows[j].view) for j in jobs]
-        ):
+        rows = [self.campaign.rows[j] for j in jobs]
+        asked = [(row.object, row.view) for row in rows]
+        if held != asked:
             raise ModelFileError("path", f"{path} of {held}", f"{asked}")
         return [shard.take(i) for i in range(len(jobs))]
 

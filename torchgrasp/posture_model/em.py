@@ -257,7 +257,7 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
     This density is log(weight) + log N(x | mean, covariance).
     """
     means = components.means
-    d = components.means.shape[1]
+    d = means.shape[1]
     whitening = whitening_matrices(components.covariances)
     precision = whitening.mT @ whitening
     linear = (precision @ means[..., None])[..., 0]
