@@ -229,8 +229,9 @@ def likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:
     """Return an object's likely centre (3,) [m] in the hand's frame, and its largest likely weight
     [N].
 
-    The weight is that of water in the volume of the estimated surface, or else of a ball as wide as
-    the contacts. It is at least that of `WEIGHT.mass`: a small thing may be of metal.
+    The weight is that of water in the volume of the estimated surface. Without a surface, a ball as
+    wide as the contacts replaces it. It is at least that of `WEIGHT.mass`: a small thing may be of
+    metal.
     """
     field = reference.surface
     points = reference.gains.target

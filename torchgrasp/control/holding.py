@@ -80,8 +80,8 @@ GRIP = GripNumbers()
 class ForceHold:
     """Hold controller that presses with balanced forces at the sensed contacts.
 
-    The joints stay compliant. Force feedback changes one common factor on all forces, because a
-    separate force loop for each finger would push the object away.
+    The joints stay compliant. Force feedback changes one common factor on all forces. A separate
+    force loop for each finger would push the object away.
 
     Args:
         reference: the closing plan.
@@ -128,8 +128,8 @@ def keep_targets(
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
     """Return the common `factor` (no unit) on all forces one tick of `period` [s] later.
 
-    It is `factor` + `period` (1 - s / `strength`), clamped to [0.5, `MAX_FACTOR`], so that the sum
-    s [N] of the sensed normal forces approaches `strength` [N].
+    It is `factor` + `period` (1 - s / `strength`), clamped to [0.5, `MAX_FACTOR`]. So the sum s [N]
+    of the sensed normal forces approaches `strength` [N].
     """
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
     return min(max(factor + period * lacking, 0.5), MAX_FACTOR)
@@ -142,8 +142,8 @@ def held_forces(
     parts.
 
     The sum is over fingertips with a working sensor. The forces act at the sensed contacts, and
-    their total wrench is zero. If a finger does not touch, or if no such forces exist that press at
-    every contact, the planned forces are returned.
+    their total wrench is zero. The planned forces are returned if a finger does not touch, or if no
+    such forces press at every contact.
     """
     gains = reference.gains
     normals = reference.normals

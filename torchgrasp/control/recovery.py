@@ -116,8 +116,8 @@ class GuardedApproach:
     readings, locates the object, moves its palm sideways and goes on. After the last allowed stop
     the hand ignores touches.
 
-    `left` [m] is the remaining length of the approach, `palm` (3,) [m] the palm's displacement from
-    its planned path, `stops` the number of stops. `displacement` (6,) holds the object's
+    `left` [m] is the remaining length of the approach, and `stops` the number of stops. `palm` (3,)
+    [m] is the palm's displacement from its planned path. `displacement` (6,) holds the object's
     translation [m] and rotation vector [rad] at the last touch. Both are in the planned hand's
     frame.
 
@@ -257,11 +257,11 @@ class GuardedApproach:
 class GraspCheck:
     """Check of a pressing grasp before the lift: `judged` becomes true when the result is known.
 
-    `secure` then says whether to lift: all fingers touch, the palm has followed the object
-    (`CHECK.misplaced`) and, if all contact points are known, forces balance with the planned
-    friction, of a distribution its mean. `displacement` (6,) holds the object's translation [m] and
-    rotation vector [rad] in the planned hand's frame. It is that of the closing. If the plan has a
-    table and a surface, it is estimated anew from all touches.
+    `secure` then says whether to lift. All fingers must touch, and the palm must have followed the
+    object (`CHECK.misplaced`). If all contact points are known, forces must balance with the
+    planned friction, of a distribution its mean. `displacement` (6,) holds the object's translation
+    [m] and rotation vector [rad] in the planned hand's frame. It is that of the closing. If the
+    plan has a table and a surface, it is estimated anew from all touches.
 
     Args:
         reference: the closing plan.

@@ -78,15 +78,15 @@ class UncertaintyClosing:
     """The default closing controller: Eqs. (25), (26) and (28) of the paper with
     `surface_covariance`, and extensions.
 
-    * A finger that does not touch searches along the normal of its planned contact, even beyond the
-      contact, but not below the table. A finger that touches is force-controlled, whatever its
+    * A finger that does not touch searches along the normal of its planned contact, even beyond it.
+      It does not go below the table. A finger that touches is force-controlled, whatever its
       position error.
     * Before the first touch the fingers keep pace: all reach their contacts at the same time.
     * A finger without a working sensor rests at its estimated contact until the others touch. Then
       it searches until its drives sense a contact, or until it is three standard deviations beyond
       the contact.
-    * Fingertips whose contacts are on the rim of a low object go down to the table, and slide along
-      it to the object.
+    * Fingertips with contacts on the rim of a low object go down to the table. They slide along it
+      to the object.
     * A palm that starts above its planned pose (`ClosingReference.rise`) goes down as far as the
       fingers' arcs go up.
     * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers

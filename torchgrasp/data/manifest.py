@@ -240,8 +240,8 @@ def list_views(
         only: names of the objects to list. Empty means all objects.
         most: largest number of views of each object, the first by name. None means all.
 
-    Raises `DatasetError` if there is no manifest, if it has no objects or lacks one of `only`, or
-    if the entry of an object in it is malformed.
+    Raises `DatasetError` for a missing manifest, or one that has no objects or lacks one of `only`.
+    It is also raised for a malformed entry of an object.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())

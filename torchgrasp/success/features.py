@@ -154,8 +154,8 @@ def measure_grasps(
 def weight_about(
     points: Float[Tensor, "g f 3"], center: Float[Tensor, "*g 3"], mass: float
 ) -> Float[Tensor, "g 6"]:
-    """Return the weight of a mass [kg] as a force [N] and a torque [N m] about the centroid of each
-    contact set.
+    """Return the weight of a mass [kg] about the centroid of each contact set: force [N], then
+    torque [N m].
 
     The contacts (g, f, 3) [m] and the centre of mass are in an upright frame.
     """
@@ -200,8 +200,8 @@ def _force_for(
     masses: Sequence[float],
     lifted: bool,
 ) -> Float[Tensor, "n m g"]:
-    """Return the force [N] of the strongest finger at which no contact slides under the load, for n
-    friction coefficients and m masses [kg].
+    """Return the force [N] of the strongest finger at which no contact slides under the load. There
+    is one for each of n friction coefficients, m masses [kg] and g grasps.
 
     The load is the weight of the mass if the object is `lifted`, and otherwise a pull in any
     direction.

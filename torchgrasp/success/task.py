@@ -91,9 +91,9 @@ class GraspTask(Value):
     def pressing(self, lifted: bool) -> float:
         """Return the normal force [N] of the strongest finger.
 
-        This is the field `force`. If that is None, it is 4 N in pulls and 0 in a lift, where the
-        hand presses as much as the felt load needs. `lifted` says whether the task is a lift, as
-        `lifts` returns it.
+        This is the field `force`. If that is None, it is 4 N in pulls and 0 in a lift. In a lift
+        the hand presses as much as the felt load needs. `lifted` says whether the task is a lift,
+        as `lifts` returns it.
         """
         return self.force or (0.0 if lifted else 4.0)
 
