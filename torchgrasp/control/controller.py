@@ -312,8 +312,7 @@ class GraspController:
             return self.targets.joints
         if self.judges:
             if self.time == 0.0:
-                nothing = torch.zeros(0, 4, dtype=torch.float64)
-                self.felt.append(Touches(self.reference, nothing))
+                self.felt.append(Touches(self.reference, kept=True))
             self.felt[-1].add(observation, closing.palm)
         self.time += period
         return closing(observation, period)

@@ -191,7 +191,7 @@ class GuardedApproach:
             self.time = 0.0
             self.feeling = True
             self.retreat = min(self.left + APPROACH.back, self.length)
-            self.felt.append(Touches(self.reference, links))
+            self.felt.append(Touches(self.reference, links, kept=True))
             self.search = Localization(self.reference, self.felt)
             self.felt[-1].add(observation, self._displaced())
         else:
