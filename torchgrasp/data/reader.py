@@ -108,7 +108,7 @@ class GraspShards:
         """
         i = range(len(self))[operator.index(i)]
         j = bisect.bisect_right(self.starts, i) - 1
-        _, records = self.recent.get(j // self.size, self._read).take(j % self.size)
+        _, records = self._take(j)
         grasps = records.grasps
         g = i - self.starts[j]
         contacts = grasps.contacts
@@ -143,11 +143,15 @@ class GraspShards:
             ModelFileError: the job's file is missing, damaged, or of another campaign.
         """
         j = range(len(self.jobs))[j]
-        row, records = self.recent.get(j // self.size, self._read).take(j % self.size)
+        row, records = self._take(j)
         grasps = dataclasses.replace(records.grasps, meta=dict(row[0].meta))
         eye = records.viewpoints[0] if bool(records.viewpoints.any()) else None
         cloud = PointCloud(records.points, viewpoint=eye) if len(records.points) else None
         return ShardJob(row[0], cloud, grasps, records.passed, records.outcome)
+
+    def _take(self, j: int) -> Shard:
+        """Return a shard that holds only job j."""
+        return self.recent.get(j // self.size, self._read).take(j % self.size)
 
     def _read(self, k: int) -> Shard:
         """Read shard k (a file of results); raise an error if its jobs are not those listed in

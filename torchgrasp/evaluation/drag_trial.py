@@ -130,7 +130,7 @@ def drag_object(
     solid, parts = solid_of(mesh, parts)
     table = plan.table if table is None else table
     check_stand(solid, table)
-    spec = draw_trial(_choose(spec), seed)
+    spec = draw_trial(_spec_of(spec), seed)
     _check_sensor(spec.sensor, plan, hand)
     return _Drag(plan, hand.to("cpu", torch.float64), solid, parts, table, spec, seed).complete()
 
@@ -223,10 +223,10 @@ def lift_from_edge(
             return EdgeLift(drag, ())
     truth = Truth(solid, pieces, table=table)
     trial = GraspTrial(hand, good, truth, seed, surface=surface_field(plan.shape))
-    return EdgeLift(drag, lift_grasps(trial, _choose(spec), tries))
+    return EdgeLift(drag, lift_grasps(trial, _spec_of(spec), tries))
 
 
-def _choose(spec: TrialSpec | None) -> TrialSpec:
+def _spec_of(spec: TrialSpec | None) -> TrialSpec:
     """Return the parameters of a trial; by default the table has the friction that plans expect."""
     return TrialSpec(table_friction=DRAGS.table_friction) if spec is None else spec
 

@@ -94,7 +94,7 @@ def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry,
     def start(grasp: Grasps) -> GraspController:
         nonlocal driver, run
         if run is not None:
-            driver = _again(driver, grasp, done[-1].result, run.controller.displacement)
+            driver = _next_driver(driver, grasp, done[-1].result, run.controller.displacement)
         run = driver.open()
         return run.controller
 
@@ -140,7 +140,7 @@ class _CheckedLift(_Lift):
         return self._verdict() if self.attempt.lost else status
 
 
-def _again(
+def _next_driver(
     driver: TrialDriver, grasp: Grasps, result: ClosureResult, felt: Float[Tensor, "4 4"]
 ) -> TrialDriver:
     """Return the driver of the next try, of another `grasp`, where the last try left the bodies.

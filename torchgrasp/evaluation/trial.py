@@ -184,6 +184,9 @@ class TrialDriver:
         """
         spec = self.spec
         truth = self.trial.truth
+        edge = None
+        if spec.table:
+            edge = edge_in_world(true_table(self.trial.grasp, truth), self.obj_from_world)
         rise = self.reference.rise
         true_pose = apply_error(grasp.obj_from_hand[0], truth.error)
         turn = true_pose[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T
@@ -199,14 +202,10 @@ class TrialDriver:
             approach=tuple(approach.tolist()),
             table=spec.table,
             height=None if truth.table is None else 0.0,
-            edge=self._edge() if spec.table else None,
+            edge=edge,
             neighbours=tuple(self._body(x, x.mass) for x in truth.neighbours),
             yields=spec.components.palm_reach + relooked + float(rise.norm()),
         )
-
-    def _edge(self) -> tuple[float, float, float] | None:
-        """Return the edge of the true table in the simulator's frame; None without one."""
-        return edge_in_world(true_table(self.trial.grasp, self.trial.truth), self.obj_from_world)
 
     def _body(self, given: Truth | Neighbour, mass: float | None = None) -> Body:
         """Return a given mesh as a body of the scene; `mass` [kg] is that of a neighbour."""
