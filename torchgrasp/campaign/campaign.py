@@ -142,25 +142,7 @@ def run_campaign(
     place = Path(objects).resolve()
     test = spec.test
     rows = _list_jobs(place, spec)
-    of_hand = {
-        "name": hand.name,
-        "option": hand.source.option,
-        "sha256": hand.source.sha256,
-        "joint_names": ", ".join(hand.joint_names),
-        "finger_names": ", ".join(hand.finger_names),
-    }
-    asked = {
-        "torchgrasp": "campaign",
-        "version": 1,
-        "licence": spec.licence,
-        "objects_sha256": sha256(place / "manifest.json"),
-        "hand": of_hand,
-        "protocol": dataclasses.asdict(test),
-        "trials": dataclasses.asdict(spec.trials),
-        "jobs_in_shard": spec.jobs_in_shard,
-        "versions": versions(),
-        "device": spec.device,
-    }
+    asked = _request(place, hand, spec)
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, hand, test.noise.draws))
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     views = [ObjectView(place, row.object, row.view, source) for row in rows]
@@ -184,6 +166,29 @@ def run_campaign(
                 yield views[j], test, spec.trials, meta, plan, shard.index(j)
 
     return carry_out(campaign, Path(folder), work, observer)
+
+
+def _request(objects: Path, hand: Hand, spec: CampaignSpec) -> dict[str, Any]:
+    """Return the request of a campaign, the content of `campaign.json`."""
+    of_hand = {
+        "name": hand.name,
+        "option": hand.source.option,
+        "sha256": hand.source.sha256,
+        "joint_names": ", ".join(hand.joint_names),
+        "finger_names": ", ".join(hand.finger_names),
+    }
+    return {
+        "torchgrasp": "campaign",
+        "version": 1,
+        "licence": spec.licence,
+        "objects_sha256": sha256(objects / "manifest.json"),
+        "hand": of_hand,
+        "protocol": dataclasses.asdict(spec.test),
+        "trials": dataclasses.asdict(spec.trials),
+        "jobs_in_shard": spec.jobs_in_shard,
+        "versions": versions(),
+        "device": spec.device,
+    }
 
 
 def _list_jobs(objects: Path, spec: CampaignSpec) -> tuple[JobRow, ...]:
