@@ -43,12 +43,16 @@ from torchgrasp.sim.scene_spec import (
 class BodyNumbers:
     """Settings of PhysX for bodies."""
 
-    contact_offset: float = 0.002  # distance [m] at which contacts are made before shapes touch
-    # iterations of the solver for positions in each step; with more, held objects creep less
+    contact_offset: float = 0.002
+    """Distance [m] at which contacts are made before shapes touch."""
     iterations: int = 32
-    scale: float = 0.01  # ratio of true to cooked lengths; PhysX drops vertices within 0.7 mm
-    hull: int = 129  # most vertices of a hull of which PhysX keeps all, as it keeps 255 faces
-    foot: int = 100  # number of lowest vertices of a larger hull that make a shape of their own
+    """Iterations of the solver for positions in each step; with more, held objects creep less."""
+    scale: float = 0.01
+    """Ratio of true to cooked lengths; PhysX drops vertices within 0.7 mm."""
+    hull: int = 129
+    """Most vertices of a hull of which PhysX keeps all, as it keeps 255 faces."""
+    foot: int = 100
+    """Number of lowest vertices of a larger hull that make a shape of their own."""
 
 
 BODIES = BodyNumbers()
