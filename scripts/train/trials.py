@@ -21,8 +21,9 @@ import tyro
 from tqdm import tqdm
 
 from torchgrasp import plan_grasps
-from torchgrasp.campaign.cluster import check_versions, empty_shard, run_on_cluster, versions
+from torchgrasp.campaign.cluster import run_on_cluster
 from torchgrasp.campaign.folder import README, Campaign, carry_out
+from torchgrasp.campaign.job import check_versions, empty_shard, versions
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.sensor import SensorName
 from torchgrasp.contacts.region import Region

@@ -34,8 +34,9 @@ from torchgrasp.campaign import campaign as run_module
 from torchgrasp.campaign import cluster as cluster_module
 from torchgrasp.campaign import folder as folder_module
 from torchgrasp.campaign import run_campaign
-from torchgrasp.campaign.cluster import OnGpu, plan_jobs, run_on_cluster
+from torchgrasp.campaign.cluster import OnGpu, run_on_cluster
 from torchgrasp.campaign.folder import carry_out
+from torchgrasp.campaign.job import plan_jobs
 from torchgrasp.data import read_shards
 from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError, Status
 

@@ -14,7 +14,7 @@ from tests.campaign.conftest import LIFT, QUICK
 from torchgrasp import ContactSpec, Status, certify, load_hand
 from torchgrasp.app import cli
 from torchgrasp.campaign import CampaignSpec, run_campaign
-from torchgrasp.campaign import cluster as job_module
+from torchgrasp.campaign import job as job_module
 from torchgrasp.data import GraspShards, read_shards, read_view
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec, evaluate
 from torchgrasp.evaluation.views import ObjectView

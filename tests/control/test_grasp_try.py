@@ -166,7 +166,7 @@ def test_the_next_try_knows_what_a_load_that_is_too_heavy_shows_of_the_mass():
         ),
     )
     list(close_on_block(attempt.controller, 3.0))
-    attempt.controller.hold.most = 9.81  # [N], the weight of 1 kg
+    attempt.controller.hold.load.most = 9.81  # [N], the weight of 1 kg
     attempt.controller.hold.status = Status.TOO_HEAVY
     known = Distribution.parse(attempt.next().grasps.meta["mass"])
     assert known == attempt.controller.mass

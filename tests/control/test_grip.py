@@ -24,15 +24,8 @@ from tests.point_fingers import (
     reference,
 )
 from torchgrasp import Plane, Status
-from torchgrasp.control.holding import (
-    FRICTION,
-    GRIP,
-    PUSH,
-    FrictionEstimate,
-    GripHold,
-    likely_body,
-    push_reserve,
-)
+from torchgrasp.control.held_object import FRICTION, FrictionEstimate, likely_body
+from torchgrasp.control.holding import GRIP, PUSH, GripHold, push_reserve
 from torchgrasp.control.least_forces import LeastForces, _Barrier, balance, friction_ratios
 from torchgrasp.control.tactile import Observation
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere

@@ -108,7 +108,7 @@ def test_localization_finds_the_link_that_touches_on_the_side_of_earlier_touches
     links = torch.cat([CENTER + real([[0.09, 0, 0], [0.3, 0, 0.3]]), real([[0.01], [0.01]])], -1)
     far = CENTER + 0.3 * torch.eye(3).double()
     nothing = (False, False, False)
-    touches = Touches(there, links)
+    touches = Touches(there, links, kept=True)
     touches.add(dataclasses.replace(observation(contact=torch.tensor(nothing)), tips=far), STILL)
     found = locate(there, touches)
     wanted = (
@@ -151,15 +151,15 @@ def test_localization_after_closing_on_nothing_keeps_away_from_where_the_palm_wa
     assert felt[-1].nothing and not touch(there, far, BALL_POINTS, (True, False, False)).nothing
 
 
-def test_touches_with_links_keep_what_a_fingertip_felt_before_it_lost_the_object():
+def test_kept_touches_are_what_a_fingertip_felt_before_it_lost_the_object():
     there = known(ball_field())
     points = CENTER + RADIUS * BALL_POINTS
     gone = observation(contact=torch.zeros(3, dtype=torch.bool))
-    for links, felt in ((None, False), (torch.zeros(0, 4), True)):
-        touches = Touches(there, links)
+    for kept in (False, True):
+        touches = Touches(there, kept=kept)
         for seen in (*[touching(points, BALL_POINTS, (True, False, True))] * 2, gone):
             touches.add(seen, torch.zeros(3).double())
-        assert touches.felt.tolist() == [felt, False, felt]
+        assert touches.felt.tolist() == [kept, False, kept]
         assert torch.allclose(touches.means()[0][0], points[0], rtol=0, atol=1e-12)
 
 

@@ -11,7 +11,7 @@ from tests.make import random_motion, real
 from tests.pinch import QUICK, cylinder, pinch
 from torchgrasp import Plane, close_hand
 from torchgrasp.evaluation import GraspTrial, Truth
-from torchgrasp.evaluation.trial import TrialDriver, level_table
+from torchgrasp.evaluation.trial import TrialDriver, true_table
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.sim import Neighbour
@@ -118,7 +118,7 @@ def test_edges_of_tables_reach_the_simulator_and_the_controller(seed):
     assert without.scene_spec.edge is None and without.reference.table.edge is not None
 
 
-def test_a_level_table_under_the_object_ends_where_the_table_of_the_plan_ends():
+def test_a_true_table_under_the_object_ends_where_the_table_of_the_plan_ends():
     hand, grasp = pinch("barrett")
     tilt = rigid(rotation_from_vector(real([0.02, -0.03, 0.0])), real([0.0, 0.0, 0.004]))
     body = cylinder()
@@ -126,7 +126,7 @@ def test_a_level_table_under_the_object_ends_where_the_table_of_the_plan_ends():
         planned = dataclasses.replace(grasp, meta={"table": table.describe()})
         truth = Truth(body, [body])
         spec = TrialDriver(GraspTrial(hand, planned, truth), QUICK).scene_spec
-        level = level_table(planned, truth)
+        level = true_table(planned, truth)
         x, y, offset = spec.edge
         assert float(level.normal[2]) == 1.0 and level.offset == spec.table_height == 0.0
         assert level.edge.normal.tolist() == pytest.approx([x, y, 0.0], abs=1e-8)

@@ -9,18 +9,12 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from torchgrasp.campaign.cluster import (
-    OnGpu,
-    empty_shard,
-    plan_jobs,
-    run_job,
-    run_on_cluster,
-    versions,
-)
+from torchgrasp.campaign.cluster import OnGpu, run_on_cluster
 from torchgrasp.campaign.folder import Campaign, carry_out
+from torchgrasp.campaign.job import empty_shard, plan_jobs, run_job, versions
 from torchgrasp.data.manifest import read_entries
 from torchgrasp.data.reader import GraspShards
-from torchgrasp.data.shards import JobRow, short
+from torchgrasp.data.shards import JobRow, shard_ranges, short
 from torchgrasp.evaluation.protocols import Protocol, find_protocol
 from torchgrasp.evaluation.sweep import PLAN_LIMIT, TRIAL_LIMIT
 from torchgrasp.evaluation.views import EvaluationSpec, ObjectView
@@ -148,28 +142,11 @@ def run_campaign(
     place = Path(objects).resolve()
     test = spec.test
     rows = _list_jobs(place, spec)
-    of_hand = {
-        "name": hand.name,
-        "option": hand.source.option,
-        "sha256": hand.source.sha256,
-        "joint_names": ", ".join(hand.joint_names),
-        "finger_names": ", ".join(hand.finger_names),
-    }
-    asked = {
-        "torchgrasp": "campaign",
-        "version": 1,
-        "licence": spec.licence,
-        "objects_sha256": sha256(place / "manifest.json"),
-        "hand": of_hand,
-        "protocol": dataclasses.asdict(test),
-        "trials": dataclasses.asdict(spec.trials),
-        "jobs_in_shard": spec.jobs_in_shard,
-        "versions": versions(),
-        "device": spec.device,
-    }
+    asked = _request(place, hand, spec)
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, hand, test.noise.draws))
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     views = [ObjectView(place, row.object, row.view, source) for row in rows]
+    shards = shard_ranges(len(rows), spec.jobs_in_shard)
     limit = PLAN_LIMIT + TRIAL_LIMIT * spec.trials.grasps * test.noise.draws
 
     def work(numbers: Sequence[int]) -> Generator[tuple[int, bytes | Status], None, None]:
@@ -178,11 +155,9 @@ def run_campaign(
         return run_as_they_end(run_job, tasks(numbers), workers, limit)
 
     def tasks(numbers: Sequence[int]) -> Iterator[tuple[Any, ...]]:
-        size = spec.jobs_in_shard
         meta = campaign.meta
-        for k, own in itertools.groupby(numbers, lambda j: j // size):
-            jobs = range(k * size, min((k + 1) * size, len(rows)))
-            shard = [j for j in jobs if rows[j].status is Status.OK]
+        for k, own in itertools.groupby(numbers, lambda j: j // spec.jobs_in_shard):
+            shard = [j for j in shards[k] if rows[j].status is Status.OK]
             plan = None
             if spec.device != "cpu":  # a shard has one plan, whichever of its jobs are left
                 of_shard = [views[j] for j in shard]
@@ -191,6 +166,29 @@ def run_campaign(
                 yield views[j], test, spec.trials, meta, plan, shard.index(j)
 
     return carry_out(campaign, Path(folder), work, observer)
+
+
+def _request(objects: Path, hand: Hand, spec: CampaignSpec) -> dict[str, Any]:
+    """Return the request of a campaign, the content of `campaign.json`."""
+    of_hand = {
+        "name": hand.name,
+        "option": hand.source.option,
+        "sha256": hand.source.sha256,
+        "joint_names": ", ".join(hand.joint_names),
+        "finger_names": ", ".join(hand.finger_names),
+    }
+    return {
+        "torchgrasp": "campaign",
+        "version": 1,
+        "licence": spec.licence,
+        "objects_sha256": sha256(objects / "manifest.json"),
+        "hand": of_hand,
+        "protocol": dataclasses.asdict(spec.test),
+        "trials": dataclasses.asdict(spec.trials),
+        "jobs_in_shard": spec.jobs_in_shard,
+        "versions": versions(),
+        "device": spec.device,
+    }
 
 
 def _list_jobs(objects: Path, spec: CampaignSpec) -> tuple[JobRow, ...]:

@@ -1,63 +1,19 @@
-"""One job of a campaign, and running jobs on a Dask cluster, where a worker that dies loses only
-its own job.
-"""
+"""Tasks on a Dask cluster, where a worker that dies loses only its own task."""
 
-import contextlib
-import importlib.metadata
 import itertools
-import json
 import os
 import threading
 import uuid
 from collections.abc import Callable, Generator, Iterable
 from typing import Any, NamedTuple, TypeVar
 
-import torch
-
-from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard, short
-from torchgrasp.evaluation.protocols import Protocol
-from torchgrasp.evaluation.views import (
-    EvaluationSpec,
-    ObjectView,
-    choose_rows,
-    plan_view,
-    plan_views,
-    try_grasp,
-)
-from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError, Status
+from torchgrasp.foundation.errors import BadArgument, MissingExtra, Status
 from torchgrasp.foundation.threads import one_thread
-from torchgrasp.hand.hand import Hand
-from torchgrasp.planner.many import no_grasps
-from torchgrasp.values.planning import Grasps
 
-PACKAGES = ("torchgrasp", "torch", "numpy", "scipy", "trimesh", "sapien", "mujoco", "coacd")
-"""Packages whose versions may change the results of a campaign."""
 Result = TypeVar("Result")
 CONNECTING = "30s"  # longest time for the scheduler to answer
 # tasks that the scheduler holds at once: ten for each of a thousand workers; a task costs memory
 OUTSTANDING = 10_000
-
-
-def versions() -> dict[str, str]:
-    """Return the installed versions of `PACKAGES`; "none" for a package that is not installed."""
-    from torchgrasp import __version__
-
-    found: dict[str, str] = dict.fromkeys(PACKAGES, "none")
-    found["torchgrasp"] = __version__  # of the source; an installation may be older
-    for name in PACKAGES[1:]:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[name] = importlib.metadata.version(name)
-    return found
-
-
-def check_versions(meta: dict[str, str]) -> None:
-    """Raise `BadArgument` unless this machine has the software with which the campaign began.
-
-    `meta["versions"]` holds the versions at its start as JSON.
-    """
-    here = json.dumps(versions())
-    if here != meta["versions"]:
-        raise BadArgument("workers", f"one with {here}", f"workers with {meta['versions']}")
 
 
 class OnGpu(NamedTuple):
@@ -68,94 +24,6 @@ class OnGpu(NamedTuple):
 
     function: Callable[..., Any]
     task: tuple[Any, ...]
-
-
-def plan_jobs(meta: dict[str, str], *task: Any) -> list[Grasps | None]:
-    """Return the executable grasps of several jobs, None for a job that could not be planned.
-
-    `task` holds the arguments of `plan_views`. Raises `BadArgument` on a machine whose software
-    differs from `meta["versions"]`.
-    """
-    check_versions(meta)
-    return plan_views(*task)
-
-
-def run_job(
-    view: ObjectView,
-    protocol: Protocol,
-    spec: EvaluationSpec,
-    meta: dict[str, str],
-    plans: object = None,
-    place: int = 0,
-) -> bytes:
-    """Plan and try the grasps of one job, a `view`; return the bytes of a shard file with only this
-    job.
-
-    `protocol` is the test of each grasp, and `spec` says which grasps are tried. `meta` holds the
-    `versions` of the software with which the campaign began; every machine must have them, and the
-    same hand. `plans` is what `plan_jobs` returned, and the job's plan is `plans[place]`. If it is
-    no list (None, or the `Status` of a planning that took too long), the job is planned here. A
-    faulty object gives a `JobRow` with the reason. Errors that are not the object's fault are
-    raised.
-    """
-    check_versions(meta)
-    hand = view.load_hand()
-    if hand.source.sha256 != view.hand.sha256:
-        found = f"{view.hand.urdf_path} with other files"
-        raise BadArgument("hand", found, "the same hand on every machine")
-    plan = plans[place] if isinstance(plans, list) else None
-    try:
-        shard = _work(view, hand, protocol, spec, plan)
-    except (MissingExtra, OutputError, MemoryError, OSError):
-        raise
-    except Exception as error:  # of the library: a week of other jobs shall not end with it
-        note = short(f"{type(error).__name__}: {error}")
-        row = JobRow(view.object, view.view, Status.BROKEN, note)
-        shard = empty_shard(row, hand, protocol.noise.draws)
-    return pack_shard(shard, meta)
-
-
-def _work(
-    view: ObjectView, hand: Hand, protocol: Protocol, spec: EvaluationSpec, plan: Grasps | None
-) -> Shard:
-    """Plan grasps on the view of a job unless there is a plan, and try the chosen grasps in
-    simulation.
-    """
-    score, cloud, found = plan_view(view, protocol, spec, plan)
-    note = short(score.note)
-    row = JobRow(view.object, view.view, score.refusal, note, score.family, score.group)
-    draws = protocol.noise.draws
-    if cloud is None or found is None:
-        return empty_shard(row, hand, draws)
-    ranks = choose_rows(len(found), spec.grasps, spec.ranks)
-    passed = torch.zeros(len(ranks), draws, dtype=torch.bool)
-    outcome = torch.zeros(passed.shape, dtype=torch.int64)
-    for k, rank in enumerate(ranks):
-        for draw in range(draws):
-            tried = try_grasp(view, found, protocol, spec, (rank, draw))
-            passed[k, draw] = tried.passed
-            outcome[k, draw] = int(tried.status)
-    row = row._replace(
-        executable=len(found),
-        points=len(cloud),
-        grasps=len(ranks),
-        passed=int(passed.sum()),
-        meta=found.meta,
-    )
-    eye = torch.zeros(3) if cloud.viewpoint is None else cloud.viewpoint
-    points = cloud.points.double()
-    return Shard((row,), Records(points, eye.double()[None], found[ranks], passed, outcome))
-
-
-def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
-    """Return the shard of a job that has neither a cloud nor grasps.
-
-    `row` is its outcome, and `draws` the number of trials of each grasp in the campaign.
-    """
-    points = torch.zeros(0, 3, dtype=torch.float64)
-    eye = torch.zeros(1, 3, dtype=torch.float64)
-    tried = torch.zeros(0, draws, dtype=torch.int64)
-    return Shard((row,), Records(points, eye, no_grasps(hand), tried.bool(), tried))
 
 
 def run_on_cluster(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchgrasp.data.reader import CARD, GraspShards, read_shards, shard_path
-from torchgrasp.data.shards import JobRow, Shard, join_shards, load_shard, pack_shard
+from torchgrasp.data.shards import JobRow, Shard, join_shards, load_shard, pack_shard, shard_ranges
 from torchgrasp.data.table_folder import render_card
 from torchgrasp.files import begin_folder, format_json, hold_folder, remove_file, sha256, write_file
 from torchgrasp.foundation.errors import ModelFileError, Status
@@ -109,10 +109,11 @@ class _Store:
         self.campaign = campaign
         self.folder = folder
         self.size = int(campaign.asked["jobs_in_shard"])
-        self.shards = range(-(-len(campaign.rows) // self.size))
+        # the indices of the jobs in each shard
+        self.shards = shard_ranges(len(campaign.rows), self.size)
         self.rows: dict[int, JobRow] = {}
         self.digests: dict[int, str] = {}
-        for k in self.shards:
+        for k in range(len(self.shards)):
             rows = {j: shard.rows[0]._replace(meta={}) for j, shard in self._find(k).items()}
             self.rows |= {j: row for j, row in rows.items() if row.status not in FAILED}
             self._close(k)
@@ -133,7 +134,7 @@ class _Store:
         single jobs.
         """
         rows = [self.rows[j] for j in range(len(self.campaign.rows))]
-        card = card_of(self.campaign, rows, [self.digests[k] for k in self.shards])
+        card = card_of(self.campaign, rows, [self.digests[k] for k in range(len(self.shards))])
         write_file(self.folder / README, render_card("shards.md", card=card))
         write_file(self.folder / CARD, format_json(card) + "\n")
         with contextlib.suppress(OSError):  # it may hold what is not ours
@@ -143,7 +144,7 @@ class _Store:
         """Return the undamaged jobs of shard k by index, read from the file of the job or of the
         shard.
         """
-        jobs = self._jobs(k)
+        jobs = self.shards[k]
         found = dict[int, Shard]()
         with contextlib.suppress(ModelFileError):
             found = dict(zip(jobs, self._load(shard_path(self.folder, k), jobs), strict=True))
@@ -157,7 +158,7 @@ class _Store:
         single jobs.
         """
         path = shard_path(self.folder, k)
-        jobs = self._jobs(k)
+        jobs = self.shards[k]
         if any(j not in self.rows for j in jobs):
             return
         if any(self._part(j).is_file() for j in jobs):
@@ -166,10 +167,6 @@ class _Store:
         self.digests[k] = sha256(path)
         for j in jobs:
             remove_file(self._part(j))
-
-    def _jobs(self, k: int) -> range:
-        """Return the indices of the jobs whose results are stored in shard k."""
-        return range(k * self.size, min((k + 1) * self.size, len(self.campaign.rows)))
 
     def _part(self, j: int) -> Path:
         """Return the path of the file of job j, used until its shard is complete."""
@@ -181,9 +178,9 @@ class _Store:
         """
         shard = load_shard(path, self.campaign.meta)
         held = [(row.object, row.view) for row in shard.rows]
-        if held != (
-            asked := [(self.campaign.rows[j].object, self.campaign.rows[j].view) for j in jobs]
-        ):
+        rows = [self.campaign.rows[j] for j in jobs]
+        asked = [(row.object, row.view) for row in rows]
+        if held != asked:
             raise ModelFileError("path", f"{path} of {held}", f"{asked}")
         return [shard.take(i) for i in range(len(jobs))]
 

@@ -307,15 +307,19 @@ class GraspController:
                     return self.targets.joints
             return self.hold(observation, period)
         over = closing.done or self.time >= CLOSING_TIME
-        if not over or not closing.feels:
-            if self.judges:
-                if self.time == 0.0:
-                    nothing = torch.zeros(0, 4, dtype=torch.float64)
-                    self.felt.append(Touches(self.reference, nothing))
-                self.felt[-1].add(observation, closing.palm)
-            self.time += period
-            return closing(observation, period)
-        # the closing has ended: this tick makes the hold, and keeps the targets
+        if over and closing.feels:
+            self._begin_hold(observation)
+            return self.targets.joints
+        if self.judges:
+            if self.time == 0.0:
+                self.felt.append(Touches(self.reference, kept=True))
+            self.felt[-1].add(observation, closing.palm)
+        self.time += period
+        return closing(observation, period)
+
+    def _begin_hold(self, observation: Observation) -> None:
+        """Make the hold controller, and the check of the grasp if it is judged before the lift."""
+        closing = self.closing
         if self._make_hold is None:
             assert isinstance(closing, LawClosing)
             self.hold = closing.press()
@@ -327,7 +331,6 @@ class GraspController:
             self.check = GraspCheck(
                 self.reference, closing.displacement, closing.palm, last, self.felt
             )
-        return self.targets.joints
 
     def _judge(self, observation: Observation) -> None:
         """Start to reopen the hand if the check of the pressing grasp found that a lift would

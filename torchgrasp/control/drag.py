@@ -202,6 +202,6 @@ class DragController:
 
 
 def _shortened(vector: Float[Tensor, "3"], most: float) -> Float[Tensor, "3"]:
-    """Return a vector, shortened to the length `most` if it is longer."""
+    """Return a vector, shortened to the length `most` if it is longer; both may be 0."""
     length = float(norm(vector))
     return vector if length <= most else vector * (most / length)

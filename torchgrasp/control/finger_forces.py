@@ -195,15 +195,29 @@ def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
     return torch.tensor(kps, dtype=torch.float64, device="cpu")
 
 
+def drive_efforts(hand: Hand) -> Float[Tensor, " j"]:
+    """Return the largest torque [N m] of the drive of each joint of the URDF."""
+    efforts = [hand.actuators[name].effort for name in hand.tree.joint_names]
+    return torch.tensor(efforts, dtype=torch.float64, device="cpu")
+
+
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
     """Return the stiffness [N m/rad] of each actuated joint, together with the joints coupled to
     it.
 
     `kp` [N m/rad], if given, replaces the stiffness of every drive.
     """
+    return coupled_stiffness(hand, drive_stiffness(hand, kp))
+
+
+def coupled_stiffness(hand: Hand, drives: Float[Tensor, " j"]) -> Float[Tensor, "h"]:
+    """Return the stiffness [N m/rad] of each actuated joint, together with the joints coupled to
+    it.
+
+    `drives` [N m/rad] are the stiffnesses of the drives of all joints of the URDF.
+    """
     coupling = hand.actuated.coupling
-    stiffness = drive_stiffness(hand, kp).to(coupling)
-    return (coupling**2 * stiffness[:, None]).sum(0)
+    return (coupling**2 * drives.to(coupling)[:, None]).sum(0)
 
 
 def tip_compliance(

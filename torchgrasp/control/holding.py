@@ -6,7 +6,6 @@ in the hand's frame. f counts the fingertips, and j all joints of the URDF.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -15,12 +14,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.balance import least_friction_forces
+from torchgrasp.control.finger_forces import drive_efforts
+from torchgrasp.control.held_object import LOAD, FrictionEstimate, LoadEstimate, likely_body
 from torchgrasp.control.law import TINY
 from torchgrasp.control.least_forces import Balance, LeastForces, balance, friction_ratios
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation, smooth
 from torchgrasp.foundation.errors import Status
-from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.values.distribution import Distribution
 
 MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a sensor reads too little
@@ -30,33 +31,11 @@ PUSH = 2.5
 
 
 @dataclasses.dataclass(frozen=True)
-class FrictionNumbers:
-    """Parameters of `FrictionEstimate`, the running estimate of the friction coefficient."""
-
-    mean: float = 0.8
-    """Estimate at the start, if the grasp was planned for a single coefficient."""
-    std: float = 0.2
-    """Standard deviation of this estimate."""
-    least_std: float = 0.03
-    """Least standard deviation of the estimate; larger: it follows later readings more."""
-    least: float = 0.15
-    """Lower bound of the coefficient at the start; a finger that sticks raises it."""
-    most: float = 1.5
-    """Largest coefficient that is estimated."""
-    noise: float = 0.4
-    """Standard deviation [N] of a fingertip's force; over the normal force, that of the ratio."""
-    sure: float = 2.0
-    """Standard deviations within which a coefficient is likely."""
-
-
-@dataclasses.dataclass(frozen=True)
 class GripNumbers:
     """Parameters of `GripHold`, the holding mode "grip", which carries the sensed load."""
 
     least_push: float = 0.4
     """Least normal force [N] of a finger: four standard deviations of its reading."""
-    lifted: float = 0.35
-    """Load [N] from which the object counts as lifted."""
     planned: float = 0.01
     """Least planned force of a finger, as a share of the largest."""
     fastest: float = 60.0
@@ -69,12 +48,6 @@ class GripNumbers:
     """Cut-off frequency [Hz] of the low-pass filter of the sensed normals."""
     forces: float = 8.0
     """Cut-off frequency [Hz] of the low-pass filter of the sensed forces."""
-    load: float = 3.0
-    """Cut-off frequency [Hz] of the low-pass filter of the sensed load."""
-    carried: float = 0.7
-    """Cut-off frequency [Hz] of the low-pass filter of the load that counts as carried; a higher
-    one rocks the object.
-    """
     carries: float = 0.8
     """Share of the carried load that is commanded; with 1, the hand would press a rigid table with
     ever growing forces.
@@ -83,18 +56,12 @@ class GripNumbers:
     """Time [s] before which the hand may still reopen beside the object."""
     sure: float = 4.0
     """Rate [1/s] at which the reserve for a push grows after the time `settled`."""
-    lever: float = 0.1
-    """Longest lever [m] at which weight and pushes may turn the object."""
     slow: float = 0.008
     """Speed [m/s] of a fingertip along the surface above which it slides."""
     slide: float = 0.03
     """Time [s] of sliding after which the filtered forces show the friction."""
     ratio: float = 2.0
     """Largest ratio of tangential to normal force that the friction estimate sees."""
-    growth: float = 1.05
-    """Ratio to the largest load so far, above which a load counts as new."""
-    steady: float = 0.3
-    """Time [s] without a new load after which the load is steady."""
     release: float = 3.0
     """Rate [1/s] at which forces that are not needed fall once the load is steady."""
     changes: float = 2.0
@@ -107,36 +74,14 @@ class GripNumbers:
     """Gain [1/s] of the feedback of felt forces."""
 
 
-@dataclasses.dataclass(frozen=True)
-class WeightNumbers:
-    """Values from which the likely weight of an object is estimated."""
-
-    density: float = 1000.0
-    """Density [kg/m^3]: that of water."""
-    mass: float = 0.4
-    """Least mass [kg]: a small thing may be of metal."""
-    noise: float = 0.5
-    """Standard deviation [N] of the load that the fingertips feel in one tick."""
-    share: float = 0.05
-    """Standard deviation of the mean load by motion and oblique contacts, as a share of it."""
-    sure: float = 2.0
-    """Standard deviations within which a mass is likely."""
-    gravity: float = 9.81
-    """Acceleration [m/s^2] of a weight."""
-    most: float = 10.0
-    """Largest mass [kg] of an object."""
-
-
-FRICTION = FrictionNumbers()
 GRIP = GripNumbers()
-WEIGHT = WeightNumbers()
 
 
 class ForceHold:
     """Hold controller that presses with balanced forces at the sensed contacts.
 
-    The joints stay compliant. Force feedback changes one common factor on all forces, because a
-    separate force loop for each finger would push the object away.
+    The joints stay compliant. Force feedback changes one common factor on all forces. A separate
+    force loop for each finger would push the object away.
 
     Args:
         reference: the closing plan.
@@ -151,7 +96,7 @@ class ForceHold:
         self.rest = observation.joints
         forces, self.strength = held_forces(reference, observation)
         self.lead = torch.einsum("cij,ci->j", observation.jacobian, forces) / reference.kp
-        largest = float(torch.linalg.vector_norm(forces, dim=-1).max())
+        largest = float(norm(forces).max())
         self.most = MAX_FACTOR
         if reference.max_force is not None:
             self.most = min(MAX_FACTOR, reference.max_force / largest)
@@ -183,8 +128,8 @@ def keep_targets(
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
     """Return the common `factor` (no unit) on all forces one tick of `period` [s] later.
 
-    It is `factor` + `period` (1 - s / `strength`), clamped to [0.5, `MAX_FACTOR`], so that the sum
-    s [N] of the sensed normal forces approaches `strength` [N].
+    It is `factor` + `period` (1 - s / `strength`), clamped to [0.5, `MAX_FACTOR`]. So the sum s [N]
+    of the sensed normal forces approaches `strength` [N].
     """
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
     return min(max(factor + period * lacking, 0.5), MAX_FACTOR)
@@ -197,8 +142,8 @@ def held_forces(
     parts.
 
     The sum is over fingertips with a working sensor. The forces act at the sensed contacts, and
-    their total wrench is zero. If a finger does not touch, or if no such forces exist that press at
-    every contact, the planned forces are returned.
+    their total wrench is zero. The planned forces are returned if a finger does not touch, or if no
+    such forces press at every contact.
     """
     gains = reference.gains
     normals = reference.normals
@@ -216,71 +161,6 @@ def held_forces(
             normals = sensed.normals
     pushes = (forces * normals).sum(-1) * reference.alive
     return forces, float(-pushes.sum())
-
-
-class FrictionEstimate:
-    """A running estimate of the friction coefficient, common to all fingertips.
-
-    `mean` is the estimate, `std` its standard deviation, and `least` a lower bound of the
-    coefficient.
-
-    Args:
-        prior: the coefficient that the grasp was planned for. A distribution gives mean and
-            deviation at the start; with a number they are those of `FRICTION`.
-    """
-
-    def __init__(self, prior: float | Distribution) -> None:
-        self.prior = Distribution.of(prior)
-        self.mean = FRICTION.mean
-        self.std = FRICTION.std
-        self.least = FRICTION.least
-        self.most = FRICTION.most
-        if self.prior.least < self.prior.most:
-            self.mean = self.prior.mean
-            self.std = max(self.prior.std, FRICTION.least_std)
-            self.least = min(self.prior.least, FRICTION.least)
-            self.most = max(self.prior.most, FRICTION.most)
-        self.held = 0.0  # lower bound that sticking fingertips have surely shown
-        self.slid = False
-
-    def update(self, ratio: float, force: float, slides: bool = True) -> None:
-        """Update the estimate by the sensed force of one fingertip.
-
-        `ratio` is its tangential over its normal force, `force` [N] its normal force, and `slides`
-        says whether it slides. A fingertip that sticks shows that friction is at least its ratio. A
-        slide with a ratio below `least` is taken for a spin about the normal, and ignored.
-        """
-        noise = FRICTION.noise * math.hypot(1.0, ratio) / force
-        if not slides:
-            self.held = max(self.held, ratio - FRICTION.sure * noise)
-            self.least = max(self.least, ratio - noise)
-            self.mean = max(self.mean, self.least)
-        elif ratio + noise > self.least:
-            weight = self.std**2 / (self.std**2 + noise**2)
-            mean = self.mean + weight * (ratio - self.mean)
-            self.mean = min(max(mean, self.least), self.most)
-            self.std = max(self.std * math.sqrt(1 - weight), FRICTION.least_std)
-            self.slid = True
-
-    @property
-    def posterior(self) -> Distribution:
-        """The prior, cut where fingertips have stuck or slid.
-
-        A fingertip that sticks bounds the coefficient below; one that slides bounds it above. Where
-        the prior excludes what is left, the touches alone decide.
-        """
-        around = FRICTION.sure * self.std
-        high = self.mean + around if self.slid else math.inf
-        if self.prior.share(self.held, high) > 0.0:
-            return self.prior.given(self.held, high)
-        if self.slid:
-            return Distribution.between(max(self.mean - around, self.held), high)
-        return Distribution.of(self.held)
-
-    @property
-    def high(self) -> float:
-        """An upper bound of the friction coefficient: the mean plus one standard deviation."""
-        return self.mean + self.std
 
 
 class GripHold:
@@ -307,33 +187,26 @@ class GripHold:
         self.start = start.numpy()
         self.rest = observation.joints.numpy()
         self.stiffness = reference.kp.numpy()
-        effort = np.array([hand.actuators[name].effort for name in hand.tree.joint_names])
         forces = held_forces(reference, observation)[0].numpy()
         self.normals = _sensed(observation, reference.normals.numpy())
         self.radius = hand.tips.radius.numpy()
-        self.solver = LeastForces(forces.copy(), effort, max_force)
+        self.solver = LeastForces(forces.copy(), drive_efforts(hand).numpy(), max_force)
         push = np.abs((forces * self.normals).sum(-1))  # (f,)
         largest = max(float(push.max()), GRIP.least_push)
         self.planned = np.maximum(push, GRIP.planned * largest)
         # the closing has pressed so hard
         self.grip = np.minimum(push, max_force)
         self.felt = np.zeros((len(push), 3))
-        self.load = np.zeros(6)
-        self.carried = np.zeros(6)
-        self.up = None if reference.table is None else reference.table.normal.numpy()
+        up = None if reference.table is None else reference.table.normal.numpy()
+        self.load = LoadEstimate(up, PUSH)
         self.centre, self.unfelt = likely_body(reference)
         self.friction = FrictionEstimate(reference.friction)
         self.cover = 0.0
         self.aim = self.friction.mean
         self.sent = np.zeros((len(push), 3))
         self.trim = np.zeros((len(push), 3))
-        self.most = 0.0  # largest load [N] so far
         self.time = 0.0
-        self.steady = 0.0
         self.over = 0.0
-        self.released = False  # whether the load is steady
-        self.weighed = np.zeros(3)  # mean force [N] of the steady load
-        self.weighings = 0  # ticks in this mean
         self.strained = False  # whether forces are near their limits
         self.status = Status.OK
         self.slid = np.zeros(len(push))
@@ -341,7 +214,7 @@ class GripHold:
     @property
     def weight(self) -> float:
         """Size [N] of the filtered force with which the object loads the fingertips."""
-        return float(np.linalg.norm(self.load[:3]))
+        return self.load.weight
 
     @property
     def mass(self) -> Distribution | None:
@@ -349,16 +222,7 @@ class GripHold:
 
         None if no load is steady. A load that is too heavy bounds the mass below.
         """
-        if self.status is Status.TOO_HEAVY:
-            carried = (1 - WEIGHT.sure * WEIGHT.share) * self.most / WEIGHT.gravity
-            return Distribution.between(min(carried, WEIGHT.most), WEIGHT.most)
-        load = float(np.linalg.norm(self.weighed))
-        if min(load, self.weight) < GRIP.lifted:
-            return None
-        std = math.hypot(WEIGHT.noise / math.sqrt(self.weighings), WEIGHT.share * load)
-        around = WEIGHT.sure * std
-        low = max(load - around, 0.0) / WEIGHT.gravity
-        return Distribution.between(low, (load + around) / WEIGHT.gravity)
+        return self.load.exceeded if self.status is Status.TOO_HEAVY else self.load.mass
 
     @property
     def sliding(self) -> np.ndarray:
@@ -375,7 +239,7 @@ class GripHold:
         self._adapt(observation, period)
         floor = self._bounded(np.maximum(self.cover * self.grip, GRIP.least_push))
         wanted = self.solver.solve(
-            contacts, self.normals, jacobian, self.load, self.aim, floor, reserve
+            contacts, self.normals, jacobian, self.load.wrench, self.aim, floor, reserve
         )
         self._judge(wanted, jacobian, period)
         step = self._command(contacts, wanted, period) - self.sent
@@ -411,30 +275,12 @@ class GripHold:
                 # the fingers that touch cannot hold without the others
                 contacts = balance(points)
         self.felt = smooth(self.felt, forces, GRIP.forces, period)
-        load = self._weight(contacts.wrench @ forces.ravel())
-        self.load = smooth(self.load, load, GRIP.load, period)
-        self.carried = smooth(self.carried, load, GRIP.carried, period)
-        if self.released:
-            self.weighings += 1
-            self.weighed = self.weighed + (load[:3] - self.weighed) / self.weighings
+        self.load.update(contacts.wrench @ forces.ravel(), period)
         sure = min(max(GRIP.sure * (self.time - GRIP.settled), 0.0), 1.0)
         push = self.cover * sure * (PUSH + self.unfelt)
         arm = self.centre - points.mean(0)
         reserve = push * push_reserve(contacts, self.normals, arm, self.aim)
         return contacts, self._bounded(reserve)
-
-    def _weight(self, load: np.ndarray) -> np.ndarray:
-        """Return the part of the wrench `load` (6,) [N, N m] that weight and, once lifted, pushes
-        of `PUSH` can cause.
-        """
-        if self.up is None:
-            return load
-        rise = float(load[:3] @ self.up)
-        lifted = max(rise, 0.0)
-        most = PUSH if self.released else 0.0
-        side = _limited(load[:3] - rise * self.up, most)
-        torque = _limited(load[3:], GRIP.lever * (lifted + most))
-        return np.concatenate([lifted * self.up + side, torque])
 
     def _adapt(self, observation: Observation, period: float) -> None:
         """Update the friction estimate by the sensed forces of each finger; reduce forces that are
@@ -451,22 +297,11 @@ class GripHold:
         for ratio, force, slides in fingers:
             if force > 0.5 * GRIP.least_push:
                 self.friction.update(min(ratio, GRIP.ratio), force, slides)
-        self._release(period)
-
-    def _release(self, period: float) -> None:
-        """Once the lifted load is steady, reduce the forces of the closing and the reserve for an
-        unknown weight.
-        """
-        if self.weight > GRIP.growth * self.most:
-            self.most = self.weight
-            self.steady = 0.0
-        self.steady += period
-        if self.steady < GRIP.steady or self.weight < GRIP.lifted:
-            return
-        self.released = True
-        kept = 1 - min(GRIP.release * period, 1.0)
-        self.grip = self.grip * kept
-        self.unfelt = self.unfelt * kept
+        if self.load.settles(period):
+            # the closing's forces and the reserve for an unknown weight are no longer needed
+            kept = 1 - min(GRIP.release * period, 1.0)
+            self.grip = self.grip * kept
+            self.unfelt = self.unfelt * kept
 
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
         """Choose the friction coefficient for the next tick, and judge whether the load is too
@@ -481,7 +316,7 @@ class GripHold:
         self.aim += min(max(goal - self.aim, -fastest), fastest)
         self.strained = share > GRIP.near
         beyond = self.strained and self.cover == 0.0 and bool(self.sliding.any())
-        self.over = self.over + period if beyond and self.weight > GRIP.lifted else 0.0
+        self.over = self.over + period if beyond and self.weight > LOAD.lifted else 0.0
         if self.over > GRIP.over:
             self.status = Status.TOO_HEAVY
 
@@ -490,7 +325,8 @@ class GripHold:
 
         They are the `wanted` forces (f, 3) [N] plus a correction. It is the integrated difference
         between wanted and sensed normal forces, without the part that would move the object. Of the
-        load, they carry only the share `GRIP.carries` of `carried`, so new load is taken up slowly.
+        load, they carry only the share `GRIP.carries` of `LoadEstimate.carried`, so new load is
+        taken up slowly.
         `contacts` is the grasp map of the fingertips.
         """
         if self.time > RAMP:
@@ -502,7 +338,7 @@ class GripHold:
             largest = float(np.linalg.norm(trim, axis=-1).max())
             bound = float(np.linalg.norm(0.5 * wanted, axis=-1).max())
             self.trim = trim * min(1.0, bound / max(largest, TINY))
-        missing = self.load - GRIP.carries * self.carried
+        missing = self.load.wrench - GRIP.carries * self.load.carried
         return wanted + self.trim - (contacts.inverse @ missing).reshape(-1, 3)
 
 
@@ -523,38 +359,6 @@ def push_reserve(
     across = share - normals[:, :, None] * along[:, None]
     tangential = np.linalg.norm(across, ord=2, axis=(1, 2))
     return np.hypot(np.linalg.norm(along, axis=-1), tangential / friction)
-
-
-def likely_body(
-    reference: ClosingReference, numbers: WeightNumbers = WEIGHT
-) -> tuple[np.ndarray, float]:
-    """Return an object's likely centre (3,) [m] in the hand's frame, and its largest likely weight
-    [N].
-
-    The weight is that of water in the volume of the estimated surface, or else of a ball as wide as
-    the contacts. It is at least that of `numbers.mass`: a small thing may be of metal.
-    """
-    field = reference.surface
-    points = reference.gains.target
-    if field is None or not bool((field.values < 0).any()):
-        ball = math.pi / 6 * float(torch.cdist(points, points).max()) ** 3
-        centre = points.mean(0)
-        mass = numbers.density * ball
-    else:
-        shell = (field.values.abs() < field.spacing).nonzero()
-        inside = (field.values < 0).nonzero()
-        # farther than the shell the sign may be wrong
-        known = (inside >= shell.amin(0)) & (inside <= shell.amax(0))
-        inside = inside[known.all(-1)]
-        middle = field.origin + field.spacing * inside.double().mean(0)
-        centre = apply(inverse(reference.obj_from_hand), middle[None])[0]
-        mass = numbers.density * len(inside) * field.spacing**3
-    return centre.numpy(), numbers.gravity * max(mass, numbers.mass)
-
-
-def _limited(vector: np.ndarray, most: float) -> np.ndarray:
-    """Return the `vector` (3,), shortened to the length `most` if it is longer."""
-    return vector * min(1.0, most / max(float(np.linalg.norm(vector)), TINY))
 
 
 def _sensed(observation: Observation, normals: np.ndarray) -> np.ndarray:

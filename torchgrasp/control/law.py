@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.geometry.linalg import cholesky, limit_norm, squared_mahalanobis
+from torchgrasp.geometry.linalg import cholesky, limit_norm, norm, squared_mahalanobis
 
 POSITION_FLOOR = 0.005
 """Standard deviation [m], in all directions, of errors of hand pose and joint zeros; it keeps Eq.
@@ -157,7 +157,7 @@ def tip_velocity(
     if not together:
         return limit_norm(velocity, MAX_SPEED)
     moving = torch.where((velocity == 0).all(-1, keepdim=True), velocity.detach(), velocity)
-    fastest = torch.linalg.vector_norm(moving, dim=-1).amax(-1)
+    fastest = norm(moving).amax(-1)
     return velocity * (MAX_SPEED / fastest.clamp_min(MAX_SPEED))[..., None, None]
 
 

@@ -8,9 +8,9 @@ coefficient mu and a small weight eps of the barrier, the method minimises
         - eps sum [log(mu^2 (n_i - reserve_i)^2 - |t_i|^2) + log(n_i - floor_i)]
 
 over all forces that balance the load. A reserve is a part of the normal force that does not count
-for friction, so that a force stays within its cone when a push changes it. A load is a wrench (6,):
-force [N], then torque [N m] about the centroid of the contacts. All vectors are in one frame, the
-hand's. f counts the contacts, and j the joints of the URDF. It is written in NumPy, whose calls
+for friction. With it, a force stays within its cone when a push changes it. A load is a wrench
+(6,): force [N], then torque [N m] about the centroid of the contacts. All vectors are in one frame,
+the hand's. f counts the contacts, and j the joints of the URDF. It is written in NumPy, whose calls
 cost less than torch's for small matrices.
 """
 

@@ -1,9 +1,9 @@
 """Estimates of the object's pose from touches: its displacement from its pose in the plan.
 
-A displacement (6,) is a translation [m] of the contacts' centroid and a rotation vector [rad] about
-it, in the frame of the planned hand. While the fingers close, `ContactPlanes` uses the tangent
-plane at each planned contact. While the hand stands still, `Localization` compares touched points
-and normals with the estimated surface, so that it also finds displacements along the object's own
+A displacement (6,) is a translation [m] of the contacts' centroid, then a rotation vector [rad]
+about it. It is in the frame of the planned hand. While the fingers close, `ContactPlanes` uses the
+tangent plane at each planned contact. While the hand stands still, `Localization` compares touched
+points and normals with the estimated surface. It also finds displacements along the object's own
 surface. f counts the fingertips.
 """
 
@@ -153,16 +153,19 @@ class Touches:
     planned hand's frame.
 
     `known` marks fingertips with a working sensor, `felt` marks fingertips that touch and have
-    reported where. `links` (m, 4) holds the centres and radii [m] of the collision spheres of links
-    of which one touches the object, as felt by the drives; it may be empty. With `links`,
-    fingertips that no longer touch are also in `felt`; None means that they are not.
+    reported where. `links` (m, 4) holds centres and radii [m] of the collision spheres of links.
+    The drives have felt that one of them touches the object; None means that they felt none. If
+    `kept`, fingertips that no longer touch are also in `felt`.
     """
 
     def __init__(
-        self, reference: ClosingReference, links: Float[Tensor, "m 4"] | None = None
+        self,
+        reference: ClosingReference,
+        links: Float[Tensor, "m 4"] | None = None,
+        kept: bool = False,
     ) -> None:
-        self.links = torch.zeros(0, 4) if links is None else links
-        self.kept = links is not None
+        self.links = torch.zeros(0, 4, dtype=torch.float64) if links is None else links
+        self.kept = kept
         self.points = torch.zeros(reference.normals.shape, dtype=torch.float64)
         self.normals = torch.zeros(reference.normals.shape, dtype=torch.float64)
         self.count = torch.zeros(len(reference.normals), dtype=torch.int64)
@@ -192,7 +195,7 @@ class Touches:
     def felt(self) -> Bool[Tensor, "f"]:
         """Mask (f,) of the fingertips that touch the object and have reported where they touch.
 
-        If `links` is not None, those that have stopped touching are included.
+        If `kept`, those that have stopped touching are included.
         """
         return (self.contact | self.kept) & (self.count > 0)
 

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.control.finger_forces import drive_efforts
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import NOISE, Observation
 
@@ -104,8 +105,6 @@ def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
     largest torque of its drive.
     """
     hand = reference.hand
-    efforts = [hand.actuators[name].effort for name in hand.tree.joint_names]
-    effort = torch.tensor(efforts, dtype=torch.float64)
-    # infinite where nothing is driven
-    leads = (effort / reference.kp)[:, None] / hand.actuated.coupling.abs()  # (j, h)
+    # infinite where nothing is driven: (j, h)
+    leads = (drive_efforts(hand) / reference.kp)[:, None] / hand.actuated.coupling.abs()
     return leads.amin(0)

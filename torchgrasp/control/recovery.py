@@ -22,7 +22,7 @@ from torchgrasp.control.tactile import EARLY, Observation, smooth
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.linalg import limit_norm, unit
+from torchgrasp.geometry.linalg import limit_norm, norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.closing import ClosingOptions
 from torchgrasp.values.distribution import Distribution
@@ -116,8 +116,8 @@ class GuardedApproach:
     readings, locates the object, moves its palm sideways and goes on. After the last allowed stop
     the hand ignores touches.
 
-    `left` [m] is the remaining length of the approach, `palm` (3,) [m] the palm's displacement from
-    its planned path, `stops` the number of stops. `displacement` (6,) holds the object's
+    `left` [m] is the remaining length of the approach, and `stops` the number of stops. `palm` (3,)
+    [m] is the palm's displacement from its planned path. `displacement` (6,) holds the object's
     translation [m] and rotation vector [rad] at the last touch. Both are in the planned hand's
     frame.
 
@@ -191,7 +191,7 @@ class GuardedApproach:
             self.time = 0.0
             self.feeling = True
             self.retreat = min(self.left + APPROACH.back, self.length)
-            self.felt.append(Touches(self.reference, links))
+            self.felt.append(Touches(self.reference, links, kept=True))
             self.search = Localization(self.reference, self.felt)
             self.felt[-1].add(observation, self._displaced())
         else:
@@ -250,18 +250,18 @@ class GuardedApproach:
         self.displacement = displacement
         shift = palm_goal(displacement[:3], self.reference.table, self.options.palm_reach)
         self.goal = self.reference.rise + shift
-        way = float(torch.linalg.vector_norm(self.goal - self.palm))
+        way = float(norm(self.goal - self.palm))
         self.retreat = max(self.retreat, min(self.left + way, self.length))
 
 
 class GraspCheck:
     """Check of a pressing grasp before the lift: `judged` becomes true when the result is known.
 
-    `secure` then says whether to lift: all fingers touch, the palm has followed the object
-    (`CHECK.misplaced`) and, if all contact points are known, forces balance with the planned
-    friction, of a distribution its mean. `displacement` (6,) holds the object's translation [m] and
-    rotation vector [rad] in the planned hand's frame. It is that of the closing. If the plan has a
-    table and a surface, it is estimated anew from all touches.
+    `secure` then says whether to lift. All fingers must touch, and the palm must have followed the
+    object (`CHECK.misplaced`). If all contact points are known, forces must balance with the
+    planned friction, of a distribution its mean. `displacement` (6,) holds the object's translation
+    [m] and rotation vector [rad] in the planned hand's frame. It is that of the closing. If the
+    plan has a table and a surface, it is estimated anew from all touches.
 
     Args:
         reference: the closing plan.
@@ -317,7 +317,7 @@ class GraspCheck:
         touches = self.touches
         if not bool((touches.contact | ~touches.known).all()):
             return False
-        if float(torch.linalg.vector_norm(self.displacement[:3] - self.palm)) > CHECK.misplaced:
+        if float(norm(self.displacement[:3] - self.palm)) > CHECK.misplaced:
             return False
         if not bool(touches.felt.all()):
             # without all places of contacts the forces cannot be judged
@@ -466,6 +466,6 @@ def next_palm(
     """
     way = goal - palm
     longest = PALM_SPEED * period
-    if float(torch.linalg.vector_norm(way)) <= longest:
+    if float(norm(way)) <= longest:
         return goal
     return palm + limit_norm(way, longest)

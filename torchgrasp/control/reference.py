@@ -130,15 +130,15 @@ class ClosingReference(Value):
         points, normals = finger_forces.contacts_in_hand(grasp)
         preferred = None
         deviation = None
-        sure = law.FORCE_FLOOR
         if stability is not None:
             tips = points[0] + hand.tips.radius[:, None] * normals[0]
             preferred = stability.preferred_forces(tips, force).forces[None]
             # a given force has no deviation, so that none is given
             covariance = stability.preferred_forces(tips).covariance
             deviation = covariance.diagonal()[None].sqrt()
-            sure = math.hypot(law.FORCE_FLOOR, float(deviation.min()))
         desired = finger_forces.desired_forces(points, normals, force, preferred)
+        # least standard deviation [N] of a force, for which the force loop is fastest
+        sure = math.hypot(law.FORCE_FLOOR, 0.0 if deviation is None else float(deviation.min()))
         covariance = law.surface_covariance(normals, std_m)
         jacobian = hand.jacobian(grasp.joints, points)  # (1, f, 3, h)
         stiffness = finger_forces.joint_stiffness(hand, kp)

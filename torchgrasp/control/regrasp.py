@@ -30,13 +30,18 @@ from torchgrasp.values.planning import Grasps
 class RegraspNumbers:
     """Parameters by which another grasp is chosen after a failed one."""
 
-    gap: float = 0.015  # mean distance [m] of the contacts above which a grasp differs
-    turn: float = math.radians(30)  # angle [rad] of the approaches above which a grasp differs
-    share: float = 0.35  # share of the object's mass that may be concentrated at one surface point
-    withdrawal: float = 0.6  # time [s] in which the opened hand withdraws, and the object rests
-    # number of surface points, at least, that are tried as the place of this mass (fewer if the
-    # surface has fewer)
+    gap: float = 0.015
+    """Mean distance [m] of the contacts above which a grasp differs."""
+    turn: float = math.radians(30)
+    """Angle [rad] of the approaches above which a grasp differs."""
+    share: float = 0.35
+    """Share of the object's mass that may be concentrated at one surface point."""
+    withdrawal: float = 0.6
+    """Time [s] in which the opened hand withdraws, and the object rests."""
     places: int = 64
+    """Least number of surface points that are tried as the place of this mass; fewer if the surface
+    has fewer.
+    """
 
 
 REGRASP = RegraspNumbers()
@@ -152,9 +157,9 @@ class GraspTry:
     def others(self) -> Int[Tensor, "k"]:
         """The indices (k,) of the grasps that are left to try.
 
-        A grasp is left if it differs from each tried grasp. Two grasps differ by more than 30
-        degrees in approach (`REGRASP.turn`), or by more than 15 mm in the mean distance of their
-        contacts (`REGRASP.gap`).
+        A grasp is left if it differs from each tried grasp. Two grasps differ if their approaches
+        are more than 30 degrees apart (`REGRASP.turn`). They also differ if the mean distance of
+        their contacts is more than 15 mm (`REGRASP.gap`).
         """
         return list_others(self.grasps, self.tried)
 

@@ -78,15 +78,15 @@ class UncertaintyClosing:
     """The default closing controller: Eqs. (25), (26) and (28) of the paper with
     `surface_covariance`, and extensions.
 
-    * A finger that does not touch searches along the normal of its planned contact, even beyond the
-      contact, but not below the table. A finger that touches is force-controlled, whatever its
+    * A finger that does not touch searches along the normal of its planned contact, even beyond it.
+      It does not go below the table. A finger that touches is force-controlled, whatever its
       position error.
     * Before the first touch the fingers keep pace: all reach their contacts at the same time.
     * A finger without a working sensor rests at its estimated contact until the others touch. Then
       it searches until its drives sense a contact, or until it is three standard deviations beyond
       the contact.
-    * Fingertips whose contacts are on the rim of a low object go down to the table, and slide along
-      it to the object.
+    * Fingertips with contacts on the rim of a low object go down to the table. They slide along it
+      to the object.
     * A palm that starts above its planned pose (`ClosingReference.rise`) goes down as far as the
       fingers' arcs go up.
     * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers
@@ -115,6 +115,7 @@ class UncertaintyClosing:
         self.waiting = 0.0
         self.settled = Settled(reference)
         self.low = rim_contacts(reference)
+        self.fastest = RIM.fastest if bool(self.low.any()) else math.inf  # of a target [rad/s]
 
     @property
     def done(self) -> bool:
@@ -151,13 +152,9 @@ class UncertaintyClosing:
         reference = self.reference
         gains = reference.gains
         normals = reference.normals
-        contact = observation.tactile.contact
         reading = observation.tactile.reading
         tips = observation.tips + self.palm
-        if self.waits:
-            contact = self.touched | contact
-            if self.quick:
-                contact = contact | (reading >= CLOSING.touch)
+        contact = self._touching(observation)
         points = reference.contact_points(tips)
         planned, drift = self._follow(points, contact)
         error = planned - points
@@ -166,8 +163,7 @@ class UncertaintyClosing:
         touches, rests = self._without_sensor(observation, ahead, contact, period)
         contact = contact | touches
         if self.waits:
-            self.touched = self.touched | contact
-            contact = self.touched
+            self.touched = contact
         # a finger that has passed its contact is not pulled back
         error = error + ahead.clamp_max(0.0)[:, None] * normals
         share = torch.where(contact | rests, 1.0, blend(error, gains.covariance))
@@ -188,11 +184,18 @@ class UncertaintyClosing:
         lead = self.strongest
         if self.waits:
             lead = CLOSING.lead * (1 + self.waiting / CLOSING.growth)
-        fastest = RIM.fastest if bool(self.low.any()) else math.inf
         self.target = next_target(
-            reference, self.target, velocity, observation, lead, period, fastest
+            reference, self.target, velocity, observation, lead, period, self.fastest
         )
         return reference.expand(self.target)
+
+    def _touching(self, observation: Observation) -> Bool[Tensor, "f"]:
+        """Return a mask of the fingers that touch or, while the hand waits, have touched."""
+        contact = observation.tactile.contact
+        if not self.waits:
+            return contact
+        contact = self.touched | contact
+        return contact | (observation.tactile.reading >= CLOSING.touch) if self.quick else contact
 
     def _follow(
         self, points: Float[Tensor, "f 3"], contact: Bool[Tensor, "f"]

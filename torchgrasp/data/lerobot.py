@@ -92,81 +92,89 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
 
 def _files(episodes: Episodes, hand: Hand, rate: float) -> Iterator[tuple[str, str | bytes]]:
     """Yield names and contents of the files, `meta/info.json` at the end."""
-    tasks = list(dict.fromkeys(task for task, _ in episodes))
     file = "chunk-000/file-000.parquet"
-    parts = list[dict[str, Tensor]]()
-    joints = hand.tree.joint_names
-    for task, x in episodes:
-        order = [x.joint_names.index(name) for name in joints]  # simulators have their own
-        parts.append(_frames(x, order, rate, len(parts), tasks.index(task)))
-    ends = [0, *itertools.accumulate(len(part["action"]) for part in parts)]
+    tasks = list(dict.fromkeys(task for task, _ in episodes))
+    parts = [_frames(x, hand, rate, i, tasks.index(task)) for i, (task, x) in enumerate(episodes)]
     frames = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    ends = [0, *itertools.accumulate(len(part["action"]) for part in parts)]
     frames["index"] = torch.arange(ends[-1])
-    rows = []
-    for i, (start, end) in enumerate(itertools.pairwise(ends)):
-        row = {"episode_index": i, "tasks": [episodes[i][0]], "length": end - start}
-        row |= {"dataset_from_index": start, "dataset_to_index": end}
-        for of in ("data", "meta/episodes"):
-            row |= {f"{of}/chunk_index": 0, f"{of}/file_index": 0}
-        for name, x in frames.items():
-            row |= {f"stats/{name}/{key}": some for key, some in _stats(x[start:end]).items()}
-        rows.append(row)
+    spans = itertools.pairwise(ends)
+    rows = [_episode_row(frames, i, episodes[i][0], *span) for i, span in enumerate(spans)]
     yield f"data/{file}", pack_table(as_table(frames, {}))
     yield f"meta/episodes/{file}", pack_table(import_arrow().Table.from_pylist(rows))
     columns = {"task_index": torch.arange(len(tasks)), "task": tasks}
     words = as_table(columns, {"pandas": render_card("tasks.json")})
     yield "meta/tasks.parquet", pack_table(words)
     yield "meta/stats.json", json.dumps({name: _stats(x) for name, x in frames.items()}, indent=1)
-    pose = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    fingers = hand.finger_names
-    state = [*joints, *(f"hand.{x}" for x in pose)]
-    names = {
-        "action": state,
-        "observation.state": state,
-        "observation.environment_state": [f"object.{x}" for x in pose],
-        "observation.forces": [f"{finger}.{axis}" for finger in fingers for axis in "xyz"],
-    }
-    features = {
-        name: {
-            "dtype": str(x.dtype).removeprefix("torch."),
-            "shape": [*x.shape[1:]] or [1],
-            "names": names.get(name),
-        }
-        for name, x in frames.items()
-    }
     about = {
         "hand": hand,
         "rate": rate,
         "episodes": rows,
         "frames": ends[-1],
         "tasks": tasks,
-        "features": features,
+        "features": _features(frames, hand),
     }
     yield "README.md", render_card("lerobot.md", **about)
     yield "meta/info.json", render_card("info.json", **about)
 
 
 def _frames(
-    closing: ClosureResult, order: list[int], rate: float, episode: int, task: int
+    closing: ClosureResult, hand: Hand, rate: float, episode: int, task: int
 ) -> dict[str, Tensor]:
     """Return the features of a closing's frames: all its ticks but the last one, after which
     nothing is done.
     """
-    hand = _numbers(closing.hand_pose)
-    thing = _numbers(closing.object_pose)
-    number = torch.arange(len(hand) - 1)
+    # simulators have their own order of joints
+    order = [closing.joint_names.index(name) for name in hand.tree.joint_names]
+    palm = _numbers(closing.hand_pose)
+    number = torch.arange(len(palm) - 1)
     done = number == number[-1]
     return {
-        "observation.state": torch.cat([closing.joints[:, order], hand], 1)[:-1].float(),
+        "observation.state": torch.cat([closing.joints[:, order], palm], 1)[:-1].float(),
         "observation.forces": closing.trace.forces.flatten(1)[:-1].float(),
-        "observation.environment_state": thing[:-1].float(),
-        "action": torch.cat([closing.targets[:, order], hand], 1)[1:].float(),
+        "observation.environment_state": _numbers(closing.object_pose)[:-1].float(),
+        "action": torch.cat([closing.targets[:, order], palm], 1)[1:].float(),
         "next.done": done,
         "next.success": done & closing.held,
         "timestamp": (number / rate).float(),
         "frame_index": number,
         "episode_index": torch.full_like(number, episode),
         "task_index": torch.full_like(number, task),
+    }
+
+
+def _episode_row(
+    frames: dict[str, Tensor], episode: int, task: str, start: int, end: int
+) -> dict[str, Any]:
+    """Return what LeRobot stores about an episode, whose frames are those from `start` to `end`."""
+    row: dict[str, Any] = {"episode_index": episode, "tasks": [task], "length": end - start}
+    row |= {"dataset_from_index": start, "dataset_to_index": end}
+    for of in ("data", "meta/episodes"):
+        row |= {f"{of}/chunk_index": 0, f"{of}/file_index": 0}
+    for name, x in frames.items():
+        row |= {f"stats/{name}/{key}": some for key, some in _stats(x[start:end]).items()}
+    return row
+
+
+def _features(frames: dict[str, Tensor], hand: Hand) -> dict[str, dict[str, Any]]:
+    """Return the type, the shape and the names of the numbers of each feature."""
+    pose = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    state = [*hand.tree.joint_names, *(f"hand.{x}" for x in pose)]
+    names = {
+        "action": state,
+        "observation.state": state,
+        "observation.environment_state": [f"object.{x}" for x in pose],
+        "observation.forces": [
+            f"{finger}.{axis}" for finger in hand.finger_names for axis in "xyz"
+        ],
+    }
+    return {
+        name: {
+            "dtype": str(x.dtype).removeprefix("torch."),
+            "shape": [*x.shape[1:]] or [1],
+            "names": names.get(name),
+        }
+        for name, x in frames.items()
     }
 
 

@@ -174,22 +174,29 @@ def write_objects(
     for path in files:
         mesh = read_mesh(path)
         _warn_of_object(path.name, mesh)
-        low, high = mesh.bounds
-        shift = [-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]]
-        mesh = mesh.copy().apply_translation(shift)
-        folder = Path(out) / path.stem
-        write_file(folder / "mesh.ply", mesh.export(file_type="ply"))
-        poses = dict[str, object]()
-        for k in range(views):
-            first, second = torch.rand(2, generator=generator, dtype=torch.float32).tolist()
-            elevation = CAMERAS.lowest + (CAMERAS.highest - CAMERAS.lowest) * second
-            camera = look_at(360.0 * first, elevation, CAMERAS.distance, mesh)
-            noise = int(torch.randint(CAMERAS.seeds, (1,), generator=generator))
-            save_cloud(partial_view(mesh, camera, seed=noise), folder / f"view{k}_noisy.ply")
-            poses[f"view{k}"] = {"T_object_camera": camera.tolist()}
+        poses = _write_object(mesh, Path(out) / path.stem, views, generator)
         entries[path.stem] = {"views": poses}
     write_file(Path(out) / "manifest.json", format_json({"objects": entries}))
     return names
+
+
+def _write_object(
+    mesh: "trimesh.Trimesh", folder: Path, views: int, generator: torch.Generator
+) -> dict[str, object]:
+    """Write the mesh and the views of an object; return the entries of the views by name."""
+    low, high = mesh.bounds
+    shift = [-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]]
+    placed = mesh.copy().apply_translation(shift)
+    write_file(folder / "mesh.ply", placed.export(file_type="ply"))
+    poses = dict[str, object]()
+    for k in range(views):
+        first, second = torch.rand(2, generator=generator, dtype=torch.float32).tolist()
+        elevation = CAMERAS.lowest + (CAMERAS.highest - CAMERAS.lowest) * second
+        camera = look_at(360.0 * first, elevation, CAMERAS.distance, placed)
+        noise = int(torch.randint(CAMERAS.seeds, (1,), generator=generator))
+        save_cloud(partial_view(placed, camera, seed=noise), folder / f"view{k}_noisy.ply")
+        poses[f"view{k}"] = {"T_object_camera": camera.tolist()}
+    return poses
 
 
 def _warn_of_object(name: str, mesh: "trimesh.Trimesh") -> None:
@@ -240,8 +247,8 @@ def list_views(
         only: names of the objects to list. Empty means all objects.
         most: largest number of views of each object, the first by name. None means all.
 
-    Raises `DatasetError` if there is no manifest, if it has no objects or lacks one of `only`, or
-    if the entry of an object in it is malformed.
+    Raises `DatasetError` for a missing manifest, or one that has no objects or lacks one of `only`.
+    It is also raised for a malformed entry of an object.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from torchgrasp.data.reader import CARD, GraspShards
-from torchgrasp.data.shards import JobRow
+from torchgrasp.data.shards import JobRow, shard_ranges
 from torchgrasp.data.table_folder import (
     as_column,
     as_table,
@@ -56,7 +56,7 @@ def write_parquet(data: GraspShards, folder: Path | str) -> Path:
     try:
         source = {name: data.card[name] for name in ("campaign", "licence", "asked")}
         asked = source["asked"]
-        trial = source["asked"]["protocol"]["trial"]
+        trial = asked["protocol"]["trial"]
         of_campaign = {name: asked[name]["name"] for name in ("hand", "protocol")}
         of_campaign |= {
             "simulator": trial["simulator"],
@@ -74,8 +74,7 @@ def _files(data: GraspShards, of_campaign: dict[str, Any]) -> Iterator[tuple[str
     """Yield names and contents of the files: for each shard its tables, at the end the cards."""
     schemas: dict[str, Any] = {}
     meta = {"torchgrasp": json.dumps(data.card["asked"]["hand"])}
-    for k, first in enumerate(range(0, len(data.jobs), data.size)):
-        jobs = range(first, min(first + data.size, len(data.jobs)))
+    for k, jobs in enumerate(shard_ranges(len(data.jobs), data.size)):
         for name, columns in (
             ("views", _view_columns(data, jobs)),
             ("grasps", _grasp_columns(data, jobs, of_campaign)),

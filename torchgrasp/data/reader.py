@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.data.shards import MOST, JobRow, Shard, load_shard, read_row
+from torchgrasp.data.shards import MOST, JobRow, Shard, load_shard, read_row, shard_ranges
 from torchgrasp.files import Recent, read_json
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import ModelFileError
@@ -108,7 +108,7 @@ class GraspShards:
         """
         i = range(len(self))[operator.index(i)]
         j = bisect.bisect_right(self.starts, i) - 1
-        _, records = self.recent.get(j // self.size, self._read).take(j % self.size)
+        _, records = self._take(j)
         grasps = records.grasps
         g = i - self.starts[j]
         contacts = grasps.contacts
@@ -143,11 +143,15 @@ class GraspShards:
             ModelFileError: the job's file is missing, damaged, or of another campaign.
         """
         j = range(len(self.jobs))[j]
-        row, records = self.recent.get(j // self.size, self._read).take(j % self.size)
+        row, records = self._take(j)
         grasps = dataclasses.replace(records.grasps, meta=dict(row[0].meta))
         eye = records.viewpoints[0] if bool(records.viewpoints.any()) else None
         cloud = PointCloud(records.points, viewpoint=eye) if len(records.points) else None
         return ShardJob(row[0], cloud, grasps, records.passed, records.outcome)
+
+    def _take(self, j: int) -> Shard:
+        """Return a shard that holds only job j."""
+        return self.recent.get(j // self.size, self._read).take(j % self.size)
 
     def _read(self, k: int) -> Shard:
         """Read shard k (a file of results); raise an error if its jobs are not those listed in
@@ -199,7 +203,8 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     fields["campaign"].text()
     jobs = tuple(read_row(row, bare=True) for row in fields["jobs"].items(MOST))
     size = fields["jobs_in_shard"].whole(1, MOST)
-    lacking = sum(not shard_path(folder, k).is_file() for k in range(-(-len(jobs) // size)))
+    shards = range(len(shard_ranges(len(jobs), size)))
+    lacking = sum(not shard_path(folder, k).is_file() for k in shards)
     if lacking:
         found = f"{folder} without {lacking} of its shards"
         raise refuse(found, "all shards: run the campaign again")

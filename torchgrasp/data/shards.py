@@ -113,6 +113,11 @@ class Shard(NamedTuple):
         return Shard((row,), Records(records.points[points], records.viewpoints[i : i + 1], *tried))
 
 
+def shard_ranges(jobs: int, size: int) -> list[range]:
+    """Return for each shard the indices of its jobs: `size` jobs, and the rest in the last shard."""
+    return [range(first, min(first + size, jobs)) for first in range(0, jobs, size)]
+
+
 def join_shards(parts: Sequence[Shard]) -> Shard:
     """Return one shard with the jobs of several shards, in order."""
     records = map_tensors(lambda *tensors: torch.cat(tensors), *(part.records for part in parts))

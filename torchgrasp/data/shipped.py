@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from torchgrasp.data.shards import load_grasps
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.scene.file import read_scene
 from torchgrasp.scene.scene import Scene
 from torchgrasp.values.planning import Grasps, PointCloud
@@ -93,6 +95,19 @@ def load_object(name: str) -> GraspObject:
     mesh = trimesh.load_mesh(DATA / name / "mesh.ply")
     parts = [part.copy() for part in _read_parts(name)]
     return GraspObject(name, mesh, parts, read_cloud(DATA / name / "view.ply"), MASSES[name])
+
+
+def solid_of(
+    given: "trimesh.Trimesh | Path | str | GraspObject", parts: "Sequence[trimesh.Trimesh] | None"
+) -> "tuple[trimesh.Trimesh, Sequence[trimesh.Trimesh] | None]":
+    """Return the closed mesh [m] of a given object, and its convex parts.
+
+    They are `parts`. If those are None, they are the parts of a `GraspObject`, or else unknown
+    (None). Raises `MeshError` for a mesh that is missing, open or without volume.
+    """
+    if isinstance(given, GraspObject):
+        return read_mesh(given.mesh), given.parts if parts is None else parts
+    return read_mesh(given), parts
 
 
 @functools.cache

@@ -48,10 +48,9 @@ def as_table(columns: Mapping[str, Any], meta: Mapping[str, str]) -> Any:
 
 def pack_table(table: Any) -> bytes:
     """Return the bytes of the Parquet file of a table of Arrow."""
+    buffer = io.BytesIO()
     # Without dictionaries: hardly any number comes twice.
-    import_arrow().parquet.write_table(
-        table, buffer := io.BytesIO(), compression="zstd", use_dictionary=False
-    )
+    import_arrow().parquet.write_table(table, buffer, compression="zstd", use_dictionary=False)
     return buffer.getvalue()
 
 
@@ -73,7 +72,8 @@ def write_folder(
     `files` are pairs of name and content. `source.json` holds `source`, of which the files are
     made. Raises `OutputError` if the folder holds other files or cannot be written.
     """
-    with hold_folder(folder := Path(folder)):
+    folder = Path(folder)
+    with hold_folder(folder):
         begin_folder(folder / SOURCE, format_json(source) + "\n", "data")
         for name, content in files:
             write_file(folder / name, content)

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from torchgrasp.cloud.agreement import AGREEMENT, check_contacts, check_stand
 from torchgrasp.control.drag import DRAGGING, DragController
-from torchgrasp.control.finger_forces import drive_stiffness, stiff_drives
+from torchgrasp.control.finger_forces import drive_stiffness
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.data.shipped import GraspObject
-from torchgrasp.evaluation.frame import moved_mesh, rounded, world_frame
+from torchgrasp.data.shipped import GraspObject, solid_of
+from torchgrasp.evaluation.frame import rounded, rounded_table, world_frame
 from torchgrasp.evaluation.protocols import draw_trial
 from torchgrasp.evaluation.several_tries import LiftTry, lift_grasps
 from torchgrasp.evaluation.trial import TRIALS, GraspTrial, Truth
+from torchgrasp.evaluation.true_scene import edge_in_world, true_body, true_scene
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
@@ -28,17 +29,14 @@ from torchgrasp.foundation.rules import ANY, Count, Measured, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import norm
-from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.drag_plan import DragPlan
 from torchgrasp.planner.edge import EdgePlan
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import read_solid
-from torchgrasp.sim.scene_spec import SceneSpec, edge_of
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 from torchgrasp.values.closing import ClosingGains, SensorModel
-from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.specs import TrialSpec
 
 
@@ -56,11 +54,9 @@ class DragTrialNumbers:
     """Distance [m] from the planned place beyond which the tips slid over the object."""
     table_friction: float = 0.3
     """Coefficient of friction between object and table by default: that of `plan_edge_grasps`."""
-    decimals: int = 9
-    """Decimals to which offsets [m] of the table and its edge are rounded."""
 
 
-TRIAL = DragTrialNumbers()
+DRAGS = DragTrialNumbers()
 
 
 @checked
@@ -71,7 +67,7 @@ class DragResult(Value):
     Attributes:
         status: `OK`; `NO_CONTACT` if the hand could not press, or lost the object on the way;
             `DROPPED` if the object toppled, or hangs or fell over the edge; `SLIPPED` if it is
-            more than 20 mm (`TRIAL.slipped`) from where the plan wanted it; `START_OVERLAP` or
+            more than 20 mm (`DRAGS.slipped`) from where the plan wanted it; `START_OVERLAP` or
             `UNSTABLE` as in `close_hand`.
         motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform; NaN if
             the drag is `UNSTABLE`.
@@ -131,13 +127,10 @@ def drag_object(
     >>> drag_object(plan.drag, hand, box, TrialSpec(table_friction=0.3), parts=[box]).status
     <Status.OK: 0>
     """
-    if isinstance(mesh, GraspObject):
-        parts = mesh.parts if parts is None else parts
-        mesh = mesh.mesh
-    solid = read_mesh(mesh)
+    solid, parts = solid_of(mesh, parts)
     table = plan.table if table is None else table
     check_stand(solid, table)
-    spec = draw_trial(_choose(spec), seed)
+    spec = draw_trial(_spec_of(spec), seed)
     _check_sensor(spec.sensor, plan, hand)
     return _Drag(plan, hand.to("cpu", torch.float64), solid, parts, table, spec, seed).complete()
 
@@ -215,10 +208,7 @@ def lift_from_edge(
     good = plan.grasps[plan.grasps.status == Status.OK]
     if not len(good):
         raise BadArgument("plan", "no executable grasp", "at least one")
-    if isinstance(mesh, GraspObject):
-        parts = mesh.parts if parts is None else parts
-        mesh = mesh.mesh
-    solid, pieces = read_solid(read_mesh(mesh), parts)
+    solid, pieces = read_solid(*solid_of(mesh, parts))
     table = good.table if table is None else table
     drag = None
     if plan.drag is not None:
@@ -233,12 +223,12 @@ def lift_from_edge(
             return EdgeLift(drag, ())
     truth = Truth(solid, pieces, table=table)
     trial = GraspTrial(hand, good, truth, seed, surface=surface_field(plan.shape))
-    return EdgeLift(drag, lift_grasps(trial, _choose(spec), tries))
+    return EdgeLift(drag, lift_grasps(trial, _spec_of(spec), tries))
 
 
-def _choose(spec: TrialSpec | None) -> TrialSpec:
+def _spec_of(spec: TrialSpec | None) -> TrialSpec:
     """Return the parameters of a trial; by default the table has the friction that plans expect."""
-    return TrialSpec(table_friction=TRIAL.table_friction) if spec is None else spec
+    return TrialSpec(table_friction=DRAGS.table_friction) if spec is None else spec
 
 
 class _Drag:
@@ -258,47 +248,28 @@ class _Drag:
         plan = _in_world(plan, inverse(self.obj_from_world))
         self.plan = plan
         self.spec = spec
-        mesh, parts = read_solid(mesh, parts)
-        density = spec.density
-        mass = Distribution.of(spec.mass).mean if density is None else density * float(mesh.volume)
-        solid, *pieces = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
+        body = true_body(spec, mesh, parts, obj_from_world=self.obj_from_world)
         self.controller = DragController(plan, hand)
         start = plan.obj_from_hand[:3, :3] @ self.controller.targets.palm
-        joints = {name: float(q) for name, q in hand.expand(plan.joints).items()}
-        scene_spec = SceneSpec(
-            urdf_path=hand.urdf_path,
-            world_from_hand=plan.obj_from_hand.numpy(),
-            joints=joints,
-            drives=stiff_drives(hand, spec.kp),
-            tip_links=tuple(hand.tips.links),
-            mesh=solid,
-            parts=pieces,
-            mass=mass,
-            friction=Distribution.of(spec.friction).mean,
-            table_friction=spec.table_friction,
-            gravity=spec.gravity,
-            timestep=spec.timestep,
-            patch=spec.patch,
+        farthest = float(norm(plan.displacement)) + float(norm(start))
+        scene_spec = true_scene(
+            spec,
+            hand,
+            plan.obj_from_hand,
+            plan.joints,
+            body,
             height=0.0,
-            edge=self._edge(table),
-            self_pairs=hand.self_pairs if spec.self_collision else (),
-            yields=float(norm(plan.displacement))
-            + float(norm(start))
-            + DRAGGING.lag
-            + DRAGGING.deepest,
+            edge=edge_in_world(table, self.obj_from_world),
+            yields=farthest + DRAGGING.lag + DRAGGING.deepest,
             start=tuple(start.tolist()),
         )
-        self.vertices = np.asarray(solid.vertices)
+        self.vertices = np.asarray(body.mesh.vertices)
         self.scene = open_scene(scene_spec, spec.simulator)
         generator = torch.Generator().manual_seed(seed) if spec.noise else None
         self.robot = SimulatedHand(
             self.scene, _reference(hand, plan, spec), spec.control_rate, generator
         )
         self.overlap = self.scene.penetration()
-
-    def _edge(self, table: Plane) -> tuple[float, float, float] | None:
-        """Return the table's edge in the simulator's frame."""
-        return edge_of(_rounded_table(table.moved(inverse(self.obj_from_world))))
 
     def complete(self) -> DragResult:
         """Run the drag; return its record."""
@@ -311,7 +282,7 @@ class _Drag:
             targets = self.controller.step(observation, self.robot.period)
             observation = self.robot.tick(targets)
             forces.append(float(self.robot.force.sum()))
-        self.robot.rest(self.robot.ticks(TRIAL.rest))
+        self.robot.rest(self.robot.ticks(DRAGS.rest))
         return self._result(self.controller.status, start, forces)
 
     def _result(self, status: Status, start: np.ndarray, forces: list[float]) -> DragResult:
@@ -326,10 +297,10 @@ class _Drag:
             status = Status.UNSTABLE
         else:
             vertices = moved[2, :3].numpy() @ self.vertices.T + float(moved[2, 3])
-            if vertices.min() < -TRIAL.below or moved[2, 2] < math.cos(TRIAL.tipped):
+            if vertices.min() < -DRAGS.below or moved[2, 2] < math.cos(DRAGS.tipped):
                 status = Status.DROPPED
         missed = float(norm(after - before - wanted))
-        if status is Status.OK and missed > TRIAL.slipped:
+        if status is Status.OK and missed > DRAGS.slipped:
             status = Status.SLIPPED
         motion = self.obj_from_world @ moved @ inverse(self.obj_from_world)
         return DragResult(
@@ -352,14 +323,8 @@ def _in_world(plan: DragPlan, world_from_obj: Float[Tensor, "4 4"]) -> DragPlan:
         obj_from_hand=rounded(world_from_obj @ plan.obj_from_hand),
         feet=rounded(apply(world_from_obj, plan.feet)),
         displacement=rounded(turn @ plan.displacement),
-        table=_rounded_table(plan.table.moved(world_from_obj)),
+        table=rounded_table(plan.table.moved(world_from_obj)),
     )
-
-
-def _rounded_table(table: Plane) -> Plane:
-    """Return a table whose numbers, and those of its edge, are rounded."""
-    edge = None if table.edge is None else _rounded_table(table.edge)
-    return Plane(rounded(table.normal), round(table.offset, TRIAL.decimals), edge)
 
 
 def _reference(hand: Hand, plan: DragPlan, spec: TrialSpec) -> ClosingReference:

@@ -1,6 +1,4 @@
-"""The simulator's frame: its pose in the frame of a grasp, and grasps and meshes that are converted
-to it.
-"""
+"""The simulator's frame: its pose in the frame of a grasp, and grasps, tables and meshes in it."""
 
 import dataclasses
 
@@ -14,6 +12,8 @@ from torchgrasp.geometry.frames import inverse, rigid
 from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.geometry.plane import FINE, Plane, to_upright
 from torchgrasp.values.planning import Grasps
+
+DECIMALS = 9  # decimals to which the offset [m] of a table is rounded
 
 
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
@@ -56,6 +56,12 @@ def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
 def rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     """Return numbers of about size 1, rounded to multiples of the small step `FINE`."""
     return torch.round(numbers / FINE) * FINE
+
+
+def rounded_table(table: Plane) -> Plane:
+    """Return a table whose numbers, and those of its edge, are rounded."""
+    edge = None if table.edge is None else rounded_table(table.edge)
+    return Plane(rounded(table.normal), round(table.offset, DECIMALS), edge)
 
 
 def moved_mesh(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "trimesh.Trimesh":

@@ -21,9 +21,12 @@ from torchgrasp.foundation.rules import Seed
 class BootstrapNumbers:
     """Parameters of the bootstrap that finds the confidence interval of a success rate."""
 
-    resamples: int = 10_000  # resamples of the families; more: ends of the interval vary less
-    outside: float = 0.05  # probability that the value lies outside the interval
-    tails: tuple[float, float] = (0.025, 0.975)  # quantiles at the ends of the interval
+    resamples: int = 10_000
+    """Resamples of the families; with more, the ends of the interval vary less."""
+    outside: float = 0.05
+    """Probability that the value lies outside the interval."""
+    tails: tuple[float, float] = (0.025, 0.975)
+    """Quantiles at the ends of the interval."""
 
 
 BOOTSTRAP = BootstrapNumbers()

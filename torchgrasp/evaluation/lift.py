@@ -14,7 +14,7 @@ from torch import Tensor
 from torchgrasp.cloud.agreement import check_contacts, check_stand
 from torchgrasp.control.reference import check_single
 from torchgrasp.control.regrasp import smooth_step
-from torchgrasp.data.shipped import GraspObject
+from torchgrasp.data.shipped import GraspObject, solid_of
 from torchgrasp.evaluation.criterion import Tick, judge_lift, motion_between
 from torchgrasp.evaluation.trial import (
     TRIALS,
@@ -31,7 +31,6 @@ from torchgrasp.foundation.rules import Pose, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import norm
-from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
@@ -130,10 +129,7 @@ def close_hand(
     torch.Size([3, 3])
     """
     check_single(grasp)
-    if isinstance(mesh, GraspObject):
-        parts = mesh.parts if parts is None else parts
-        mesh = mesh.mesh
-    mesh = read_mesh(mesh)
+    mesh, parts = solid_of(mesh, parts)
     hand = hand if isinstance(hand, Hand) else hand_of(grasp, hand)
     check_contacts(grasp, mesh, TRIALS.slack)
     if table is not None:
@@ -180,50 +176,62 @@ class _Lift:
 
     def perform(self) -> Status:
         """Run all phases of the trial; return its status."""
-        run = self.run
         self._record()
-        if not run.starts:
+        if not self.run.starts:
             return Status.START_OVERLAP
         try:
-            for _ in run.approach():
+            for _ in self.run.approach():
                 self._record()
             self.arrived = len(self.ticks) - 1
-            for _ in run.close():
-                self._record()
-                touching = run.controller.hold is not None or self._touched_all()
-                if self.touched is None and touching:
-                    self.touched = len(self.ticks) - 1
-            self.pressed = len(self.ticks) - 1
-            self.touched = self.pressed if self.touched is None else self.touched
-            self.pushed = self._moved()
-            self.strained = run.strained()
-            self.unbalanced = run.robot.unbalanced()
-            rising = run.robot.ticks(LIFT_TIME)
-            for k in range(rising + run.robot.ticks(self.spec.hold_time)):
-                if k == rising and any(self.spec.push):
-                    run.scene.pull(np.array(self.spec.push))
-                at = (k + 1) * run.robot.period, rising * run.robot.period
-                run.scene.lift(*self._height(*at))
-                run.step()
-                self._record()
-                if self._gives_up(self._height(*at)[0]):
-                    return self._put_down(*at)
+            self._close()
+            failed = self._lift()
         except FloatingPointError:
             return Status.UNSTABLE
         except _ObjectLost:
-            pass
-        return self._verdict()
+            failed = None
+        return self._verdict() if failed is None else failed
+
+    def _close(self) -> None:
+        """Close the hand and press; record when all fingers touched, and what the pressing did."""
+        run = self.run
+        for _ in run.close():
+            self._record()
+            touching = run.controller.hold is not None or self._touched_all()
+            if self.touched is None and touching:
+                self.touched = len(self.ticks) - 1
+        self.pressed = len(self.ticks) - 1
+        self.touched = self.pressed if self.touched is None else self.touched
+        self.pushed = self._moved()
+        self.strained = run.strained()
+        self.unbalanced = run.robot.unbalanced()
+
+    def _lift(self) -> Status | None:
+        """Raise the hand and hold the object; return the failure if the hand puts it down."""
+        run = self.run
+        ticks = run.robot.ticks(LIFT_TIME)
+        rising = ticks * run.robot.period
+        for k in range(ticks + run.robot.ticks(self.spec.hold_time)):
+            if k == ticks and any(self.spec.push):
+                run.scene.pull(np.array(self.spec.push))
+            elapsed = (k + 1) * run.robot.period
+            height, speed = self._height(elapsed, rising)
+            run.scene.lift(height, speed)
+            run.step()
+            self._record()
+            if self._gives_up(height):
+                return self._put_down(elapsed, rising)
+        return None
 
     def _gives_up(self, height: float) -> bool:
         """Return whether the hand, raised to a height [m], shall put the object down."""
         return self.run.controller.status is Status.TOO_HEAVY
 
-    def _put_down(self, time: float, rising: float) -> Status:
+    def _put_down(self, elapsed: float, rising: float) -> Status:
         """Lower the hand for as long as it rose; return `TOO_HEAVY`, or `DROPPED` if the object is
         then elsewhere.
         """
-        height, _ = self._height(time, rising)
-        ticks = self.run.robot.ticks(min(time, rising))
+        height, _ = self._height(elapsed, rising)
+        ticks = self.run.robot.ticks(min(elapsed, rising))
         for k in range(ticks):
             share, rate = smooth_step((k + 1) / ticks)
             speed = -height * rate / (ticks * self.run.robot.period)
@@ -232,16 +240,16 @@ class _Lift:
             self._record()
         return Status.TOO_HEAVY if self._moved() < PUSHED_DISTANCE else Status.DROPPED
 
-    def _height(self, time: float, rising: float) -> tuple[float, float]:
-        """Return target height [m] and speed [m/s] at a time, for a rise of `rising` seconds and
-        then shaking.
+    def _height(self, elapsed: float, rising: float) -> tuple[float, float]:
+        """Return target height [m] and speed [m/s] after an `elapsed` time [s], for a rise of
+        `rising` seconds and then shaking.
         """
-        share, rate = smooth_step(min(time / rising, 1.0))
+        share, rate = smooth_step(min(elapsed / rising, 1.0))
         height = self.spec.lift_height * share
-        if time < rising or self.spec.shake == 0.0:
+        if elapsed < rising or self.spec.shake == 0.0:
             return height, self.spec.lift_height * rate / rising
         frequency = 2 * math.pi * LIFTS.shaking
-        phase = frequency * (time - rising)
+        phase = frequency * (elapsed - rising)
         speed = self.spec.shake * frequency * math.cos(phase)
         return height + self.spec.shake * math.sin(phase), speed
 

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import time
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Measured, Range
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import rotation_angle
-from torchgrasp.values.closing import ObjectMotion
 
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
 """Directions of the pulls: -x, +x, -y, +y, -z, +z of the world."""
@@ -172,31 +171,43 @@ def run_protocol(
         protocol = protocol.with_trial(push=draw_push(protocol.push, seed_of(trial.seed, "push")))
     first = trial if protocol.tries == 1 else dataclasses.replace(trial, grasp=trial.grasp[0])
     driver = TrialDriver(first, protocol.trial)
-    tries = 1
     overlap = driver.grasp_overlap()
-    if protocol.pull is not None:
-        pull = run_pulls(driver, protocol.pull)
-        status = pull.status
-        moved = pull.moved
-        turned = pull.turned
-        force = pull.force
-        slip = ObjectMotion(math.nan, math.nan)
-        passed = status is Status.OK
-        cause = ""
-        size = math.nan
+    if protocol.pull is None:
+        found = _lift_results(driver, trial, protocol)
     else:
-        lifts = run_lifts(driver, trial.grasp, protocol.tries)
-        tries = len(lifts)
-        lift = lifts[-1].result
-        status = lift.status
-        moved, turned = lift.object_motion
-        slip = lift.slip
-        force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
-        risen = lift.rise >= 0.5 * protocol.trial.lift_height
-        passed = lift.held if protocol.criterion == "held" else risen
-        cause, size = find_cause(lifts, trial, protocol.trial)
-    spent = time.process_time() - started
-    measured = moved, turned, force, overlap, spent, *slip
-    return ProtocolResult(
-        rank, draw, passed, status, *measured, tries=tries, cause=cause, size=size
-    )
+        found = _pull_results(driver, protocol.pull)
+    seconds = time.process_time() - started
+    return ProtocolResult(rank, draw, overlap=overlap, seconds=seconds, **found)
+
+
+def _pull_results(driver: TrialDriver, spec: PullSpec) -> dict[str, Any]:
+    """Run a pull trial; return its results as fields of `ProtocolResult`."""
+    pull = run_pulls(driver, spec)
+    return {
+        "passed": pull.passed,
+        "status": pull.status,
+        "moved": pull.moved,
+        "turned": pull.turned,
+        "force": pull.force,
+    }
+
+
+def _lift_results(driver: TrialDriver, trial: GraspTrial, protocol: Protocol) -> dict[str, Any]:
+    """Run the lifts of a trial; return the results of the last one as fields of `ProtocolResult`."""
+    lifts = run_lifts(driver, trial.grasp, protocol.tries)
+    lift = lifts[-1].result
+    risen = lift.rise >= 0.5 * protocol.trial.lift_height
+    closed = lift.status is not Status.START_OVERLAP
+    cause, size = find_cause(lifts, trial, protocol.trial)
+    return {
+        "passed": lift.held if protocol.criterion == "held" else risen,
+        "status": lift.status,
+        "moved": lift.object_motion.distance,
+        "turned": lift.object_motion.angle,
+        "force": float(lift.forces[-1].mean()) if closed else math.nan,
+        "slip": lift.slip.distance,
+        "slip_angle": lift.slip.angle,
+        "tries": len(lifts),
+        "cause": cause,
+        "size": size,
+    }

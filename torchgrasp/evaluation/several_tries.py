@@ -20,7 +20,7 @@ from torchgrasp.evaluation.trial import (
     TrialRun,
     Truth,
     check_truth,
-    level_table,
+    true_table,
 )
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
@@ -94,7 +94,7 @@ def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry,
     def start(grasp: Grasps) -> GraspController:
         nonlocal driver, run
         if run is not None:
-            driver = _again(driver, grasp, done[-1].result, run.controller.displacement)
+            driver = _next_driver(driver, grasp, done[-1].result, run.controller.displacement)
         run = driver.open()
         return run.controller
 
@@ -126,11 +126,11 @@ class _CheckedLift(_Lift):
         failed = alone and self.attempt.fails(self.run.observation, height, period)
         return failed or super()._gives_up(height)
 
-    def _put_down(self, time: float, rising: float) -> Status:
+    def _put_down(self, elapsed: float, rising: float) -> Status:
         """Lower the hand, open it, withdraw it and let the object come to rest; return why the lift
         failed.
         """
-        status = super()._put_down(time, rising)
+        status = super()._put_down(elapsed, rising)
         run = self.run
         withdrawal = self.attempt.withdraw(run.observation, run.robot.period, self.spec.approach)
         for targets in withdrawal:
@@ -140,7 +140,7 @@ class _CheckedLift(_Lift):
         return self._verdict() if self.attempt.lost else status
 
 
-def _again(
+def _next_driver(
     driver: TrialDriver, grasp: Grasps, result: ClosureResult, felt: Float[Tensor, "4 4"]
 ) -> TrialDriver:
     """Return the driver of the next try, of another `grasp`, where the last try left the bodies.
@@ -170,7 +170,7 @@ def _left_behind(
     planned = trial.grasp.obj_from_hand[0].to("cpu", torch.float64)
     true = apply_error(planned, truth.error)
     error = inverse(following) @ true @ felt @ inverse(planned) @ following
-    table = level_table(trial.grasp, truth) if truth.table is None else truth.table
+    table = true_table(trial.grasp, truth)
     bodies = Neighbour(read_mesh(truth.mesh), truth.parts), *truth.neighbours
     poses = result.object_pose[-1], *result.disturbance.neighbour_pose[-1]
     target, *others = (_moved(body, pose.numpy()) for body, pose in zip(bodies, poses, strict=True))

@@ -14,15 +14,21 @@ from torch import Tensor
 from torchgrasp.cloud.agreement import AGREEMENT, check_contacts
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.control.controller import GraspController
-from torchgrasp.control.finger_forces import stiff_drives
+from torchgrasp.control.finger_forces import drive_efforts
 from torchgrasp.control.holding import GripHold
 from torchgrasp.control.modes import choose_preference
 from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
 from torchgrasp.control.regrasp import smooth_step
 from torchgrasp.control.relook import REACH
-from torchgrasp.evaluation.frame import moved_mesh, rounded, to_frame, world_frame
+from torchgrasp.evaluation.frame import rounded_table, to_frame, world_frame
 from torchgrasp.evaluation.protocols import apply_error, draw_trial, seed_of
+from torchgrasp.evaluation.true_scene import (
+    edge_in_world,
+    joints_by_name,
+    true_body,
+    true_scene,
+)
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
@@ -33,12 +39,10 @@ from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
-from torchgrasp.sim.convex_parts import read_solid
-from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec, edge_of
+from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 from torchgrasp.sim.simulated_scene import SimulatedScene
 from torchgrasp.values.closing import SensorModel
-from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ClosingMode, TrialSpec
 
@@ -49,8 +53,6 @@ class TrialNumbers:
 
     unit_error: float = 1e-4
     """Greatest error of the length of the approach, a unit vector."""
-    decimals: int = 9
-    """Decimals to which a table's offset [m] is rounded."""
     speed: float = 0.2
     """Mean speed [m/s] of an unguarded approach."""
     slack: float = 0.03
@@ -132,52 +134,48 @@ class TrialDriver:
 
     Attributes:
         spec: the parameters of the trial, with friction and mass drawn by the trial's seed.
-        reference: the closing plan; by default derived from what the robot knows of the trial.
+        reference: the closing plan, derived from what the robot knows of the trial.
         obj_from_world: pose [m] of the simulator's frame in the grasp's frame. If there is a true
             table, the frame is upright on it. Numbers are then rounded, so that results are bitwise
             invariant to rigid motion.
     """
 
-    def __init__(
-        self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None
-    ) -> None:
+    def __init__(self, trial: GraspTrial, spec: TrialSpec) -> None:
         check_single(trial.grasp)
         self.trial = trial
         spec = draw_trial(spec, trial.seed)
         self.spec = spec
         hand = trial.hand.to("cpu", torch.float64)
         planned = trial.grasp.to("cpu", torch.float64)
+        pose = planned.obj_from_hand[0]
+        told = trial.grasp.table if trial.told is None else trial.told
+        # what the simulator and the robot get: in the frame of the grasp, or of world and hand
         self.obj_from_world = torch.eye(4, dtype=torch.float64)
         grasp = planned
         known = planned
-        told = trial.grasp.table if trial.told is None else trial.told
-        pose = planned.obj_from_hand[0]
         if trial.truth.table is not None:
             self.obj_from_world = world_frame(trial.truth.table, pose)
             grasp = to_frame(planned, self.obj_from_world)
             known = to_frame(planned, pose)
             if told is not None:
-                told = told.moved(inverse(pose))
-                told = _rounded_table(told)
-        if reference is None:
-            reference = derive_reference(
-                hand,
-                known,
-                told if spec.table else None,
-                trial.surface,
-                spec.closing,
-                spec.strongest,
-                spec.kp,
-                spec.sensor,
-                spec.max_force,
-            )
-            reference = dataclasses.replace(reference, obj_from_hand=pose)
+                told = rounded_table(told.moved(inverse(pose)))
+        reference = derive_reference(
+            hand,
+            known,
+            told if spec.table else None,
+            trial.surface,
+            closing=spec.closing,
+            force=spec.strongest,
+            kp=spec.kp,
+            sensor=spec.sensor,
+            max_force=spec.max_force,
+        )
+        self.reference = dataclasses.replace(reference, obj_from_hand=pose)
         hand.check_joints(grasp.pregrasp)
         length = float(norm(grasp.approach))
         if spec.approach and not abs(length - 1) < TRIALS.unit_error:
             found = f"an approach along {grasp.approach[0].tolist()}"
             raise BadArgument("grasp", found, "a unit vector")
-        self.reference = reference
         self.scene_spec = self._scene_spec(hand, grasp)
 
     def _scene_spec(self, hand: Hand, grasp: Grasps) -> SceneSpec:
@@ -186,61 +184,33 @@ class TrialDriver:
         """
         spec = self.spec
         truth = self.trial.truth
+        edge = None
+        if spec.table:
+            edge = edge_in_world(true_table(self.trial.grasp, truth), self.obj_from_world)
         rise = self.reference.rise
-        body = self._body(truth)
         true_pose = apply_error(grasp.obj_from_hand[0], truth.error)
         turn = true_pose[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T
         approach = turn @ grasp.approach[0] * spec.approach
         relooked = TRIALS.relooked * REACH * (truth.camera is not None)
-        return SceneSpec(
-            urdf_path=hand.urdf_path,
-            world_from_hand=true_pose.numpy(),
-            joints=_by_name(hand, grasp.pregrasp[0]),
-            drives=stiff_drives(hand, spec.kp),
-            tip_links=tuple(hand.tips.links),
-            mesh=body.mesh,
-            parts=list(body.parts),
-            mass=body.mass,
-            friction=Distribution.of(spec.friction).mean,
-            table_friction=spec.table_friction,
-            gravity=spec.gravity,
-            timestep=spec.timestep,
+        return true_scene(
+            spec,
+            hand,
+            true_pose,
+            grasp.pregrasp[0],
+            self._body(truth),
             travel=spec.lift_height,
             approach=tuple(approach.tolist()),
             table=spec.table,
-            patch=spec.patch,
             height=None if truth.table is None else 0.0,
-            edge=self._edge() if spec.table else None,
+            edge=edge,
             neighbours=tuple(self._body(x, x.mass) for x in truth.neighbours),
-            self_pairs=hand.self_pairs if spec.self_collision else (),
             yields=spec.components.palm_reach + relooked + float(rise.norm()),
         )
 
-    def _edge(self) -> tuple[float, float, float] | None:
-        """Return the edge of the true table in the simulator's frame, as `SceneSpec` takes it."""
-        trial = self.trial
-        table = trial.grasp.table if trial.truth.table is None else trial.truth.table
-        if table is None or table.edge is None:
-            return None
-        if trial.truth.table is None:
-            table = level_table(trial.grasp, trial.truth)
-        return edge_of(_rounded_table(table.moved(inverse(self.obj_from_world))))
-
     def _body(self, given: Truth | Neighbour, mass: float | None = None) -> Body:
-        """Return a mesh as a body of the scene: in the simulator's frame, with its convex parts and
-        its mass [kg].
-        """
-        mesh, parts = read_solid(given.mesh, given.parts)
-        if mass is None:
-            density = self.spec.density
-            mass = (
-                Distribution.of(self.spec.mass).mean
-                if density is None
-                else density * float(mesh.volume)
-            )
-        if self.trial.truth.table is not None:
-            mesh, *parts = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
-        return Body(mesh, parts, mass)
+        """Return a given mesh as a body of the scene; `mass` [kg] is that of a neighbour."""
+        moved = None if self.trial.truth.table is None else self.obj_from_world
+        return true_body(self.spec, given.mesh, given.parts, mass, moved)
 
     def _open_scene(self, spec: SceneSpec) -> SimulatedScene:
         """Return a fresh scene of a run of the trial."""
@@ -255,37 +225,33 @@ class TrialDriver:
 
     def grasp_overlap(self) -> float:
         """Return the penetration depth [m] of the hand into the object at the planned grasp."""
-        joints = _by_name(self.reference.hand, self.reference.joints)
+        joints = joints_by_name(self.reference.hand, self.reference.joints)
         alone = {"approach": (0.0, 0.0, 0.0), "table": False, "neighbours": (), "self_pairs": ()}
         scene_spec = dataclasses.replace(self.scene_spec, joints=joints, **alone)
         return open_scene(scene_spec, self.spec.simulator).penetration()
 
 
-def level_table(grasps: Grasps, truth: Truth) -> Plane:
-    """Return the level table under the mesh of a `truth` that has no table.
+def true_table(grasps: Grasps, truth: Truth) -> Plane:
+    """Return the table of a `truth`; if it is None, a level one at the mesh's lowest point.
 
-    It ends where the table of the `grasps` ends. Raises `BadArgument` if the plane of that edge is
-    all but level.
+    The level one ends where the table of the `grasps` ends. Raises `BadArgument` if the plane of
+    that edge is all but level.
     """
+    if truth.table is not None:
+        return truth.table
     box = read_mesh(truth.mesh).bounds
     level = Plane.horizontal(float(box[0, 2]))
-    table = grasps.table
-    if table is None or table.edge is None:
+    planned = grasps.table
+    if planned is None or planned.edge is None:
         return level
     centre = torch.tensor(box.mean(0).tolist(), dtype=torch.float64)
     # the point of the edge that is next to the object
-    off = [plane.height(centre) * plane.normal.to(centre) for plane in (table, table.edge)]
+    off = [plane.height(centre) * plane.normal.to(centre) for plane in (planned, planned.edge)]
     try:
-        return level.ending(centre - off[0] - off[1], table.edge.normal)
+        return level.ending(centre - off[0] - off[1], planned.edge.normal)
     except BadArgument as error:
         found = "None, with a plan whose table ends at a level edge plane"
         raise BadArgument("table", found, "the true table, a Plane") from error
-
-
-def _rounded_table(table: Plane) -> Plane:
-    """Return a table whose numbers, and those of its edge, are rounded."""
-    edge = None if table.edge is None else _rounded_table(table.edge)
-    return Plane(rounded(table.normal), round(table.offset, TRIALS.decimals), edge)
 
 
 def derive_reference(
@@ -300,6 +266,8 @@ def derive_reference(
     max_force: float | None = None,
 ) -> ClosingReference:
     """Return the closing plan, given all that the robot knows.
+
+    It takes no `TrialSpec` or `Truth`, which hold numbers of the true world.
 
     Args:
         hand: the hand of the grasp.
@@ -458,12 +426,5 @@ class TrialRun:
         hold = self.controller.hold
         if isinstance(hold, GripHold):
             return hold.strained
-        hand = reference.hand
-        effort = reference.kp.new_tensor([hand.actuators[x].effort for x in hand.tree.joint_names])
         off = (self.controller.targets.joints - self.observation.joints).abs()
-        return bool((reference.kp * off >= effort).any())
-
-
-def _by_name(hand: Hand, joints: Float[Tensor, " h"]) -> dict[str, float]:
-    """Return the positions of all URDF joints [rad] by name, given the actuated joints."""
-    return {name: float(q) for name, q in hand.expand(joints).items()}
+        return bool((reference.kp * off >= drive_efforts(reference.hand)).any())

@@ -201,7 +201,7 @@ def plan_view(
         check_stand(mesh, Plane.horizontal(0.0))
         if isinstance(planned, Path):
             return _read_planned(planned, score, cloud, hand)
-        started = time.process_time()
+        started = time.process_time()  # planning alone is timed
         stages: dict[str, Any] = {}
         found = planned or _plan(
             cloud,
@@ -256,20 +256,16 @@ def try_grasp(
     others = [k for k in range(len(grasps)) if k != at[0] and protocol.tries > 1]
     grasp = grasps[[at[0], *others]]
     hand = hand_of(grasp, view.load_hand())
-    mesh, parts = _read_solid(view.objects, view.object)
     seed = seed_of(spec.seed, view.object, view.view, *at)
-    trial = protocol.trial
-    during = protocol.displaced == "approach"
-    error = None if during else draw_error(protocol, grasp, mesh, seed)
-    slide = draw_slide(protocol.noise, seed) if during else None
-    seen = view.objects, view.object, view.view
+    truth = _draw_truth(view, grasp, protocol, seed)
     surface = None
-    if trial.table and (trial.components.stops or trial.components.attempts > 1):
-        surface = _fit_surface(*seen)
-    camera = _camera_of(read_view(*seen)) if protocol.relook else None
-    truth = Truth(mesh, parts, error, slide=slide, camera=camera)
+    components = protocol.trial.components
+    # only these controllers locate the object on its surface
+    if protocol.trial.table and (components.stops or components.attempts > 1):
+        surface = _fit_surface(view.objects, view.object, view.view)
     attempt = GraspTrial(hand, grasp, truth, seed_of(seed, "touch"), surface=surface)
     found = run_protocol(attempt, protocol, *at)
+    mesh, _ = _read_solid(view.objects, view.object)
     touch = measure_touch(hand, grasp[0], mesh)
     return dataclasses.replace(
         found,
@@ -278,6 +274,23 @@ def try_grasp(
         deepest_mm=1000 * float(touch.deepest),
         touch=touch.verdicts[0],
     )
+
+
+def _draw_truth(view: ObjectView, grasp: Grasps, protocol: Protocol, seed: int) -> Truth:
+    """Return the true world of a trial: the object with a random pose error, and the camera of a
+    second look.
+    """
+    mesh, parts = _read_solid(view.objects, view.object)
+    error = None
+    slide = None
+    if protocol.displaced == "approach":
+        slide = draw_slide(protocol.noise, seed)
+    else:
+        error = draw_error(protocol, grasp, mesh, seed)
+    camera = None
+    if protocol.relook:
+        camera = _camera_of(read_view(view.objects, view.object, view.view))
+    return Truth(mesh, parts, error, slide=slide, camera=camera)
 
 
 def _camera_of(cloud: PointCloud) -> Float[Tensor, "4 4"]:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import torch
 import torch.distributed
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, flatnonzero, row_numbers
@@ -257,7 +257,7 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
     This density is log(weight) + log N(x | mean, covariance).
     """
     means = components.means
-    d = components.means.shape[1]
+    d = means.shape[1]
     whitening = whitening_matrices(components.covariances)
     precision = whitening.mT @ whitening
     linear = (precision @ means[..., None])[..., 0]
@@ -290,26 +290,33 @@ def maximisation(
     `EM.most_reseeds` times, `IndefiniteCovariance` is raised.
     """
     components = components_from_sums(sums, n, regularisation)
-    weights = components.weights.clone()
-    means = components.means.clone()
-    covariances = components.covariances.clone()
+    covariances = components.covariances
     factor, info = torch.linalg.cholesky_ex(covariances)
     variances = factor.diagonal(dim1=-2, dim2=-1) ** 2  # (m, d), each given those before it
     regular = (info == 0) & (variances > EM.singular).all(-1)
-    collapsed = (sums[:, 0] < means.shape[1] + 1) | ~regular
-    if not bool(collapsed.any()):
-        return Components(weights / weights.sum(), means, covariances), reseeded
-    reseeded = reseeded + collapsed
-    if bool(collapsed.all()) or int(reseeded.max()) > EM.most_reseeds:
-        k = int(reseeded.argmax())
-        smallest = 0.0
-        if bool(covariances[k].isfinite().all()):
-            smallest = float(torch.linalg.eigvalsh(covariances[k]).min())
-        what = (
-            f"the covariance of component {k}, of {float(sums[k, 0]):.1f} rows, "
-            f"collapsed {int(reseeded[k])} times,"
-        )
-        raise IndefiniteCovariance(what, smallest, "use fewer components or more samples")
+    collapsed = (sums[:, 0] < covariances.shape[-1] + 1) | ~regular
+    if bool(collapsed.any()):
+        reseeded = reseeded + collapsed
+        if bool(collapsed.all()) or int(reseeded.max()) > EM.most_reseeds:
+            k = int(reseeded.argmax())
+            smallest = 0.0
+            if bool(covariances[k].isfinite().all()):
+                smallest = float(torch.linalg.eigvalsh(covariances[k]).min())
+            what = (
+                f"the covariance of component {k}, of {float(sums[k, 0]):.1f} rows, "
+                f"collapsed {int(reseeded[k])} times,"
+            )
+            raise IndefiniteCovariance(what, smallest, "use fewer components or more samples")
+        components = _split_heaviest(components, collapsed)
+    weights = components.weights / components.weights.sum()
+    return dataclasses.replace(components, weights=weights), reseeded
+
+
+def _split_heaviest(components: Components, collapsed: Bool[Tensor, "m"]) -> Components:
+    """Replace each `collapsed` component by half of the heaviest, split across its longest axis."""
+    weights = components.weights.clone()
+    means = components.means.clone()
+    covariances = components.covariances.clone()
     weights[collapsed] = 0
     for k in flatnonzero(collapsed).tolist():
         heaviest = int(weights.argmax())
@@ -320,7 +327,7 @@ def maximisation(
         means[k] = middle + half
         means[heaviest] = middle - half
         covariances[k] = covariances[heaviest]
-    return Components(weights / weights.sum(), means, covariances), reseeded
+    return Components(weights, means, covariances)
 
 
 def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: float) -> Components:

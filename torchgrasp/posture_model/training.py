@@ -191,16 +191,17 @@ def fit_mixture(
         raise BadArgument("subset", subset, f"at least {least}")
     n = shard.count()
     subsets = Subsets.of(shard, subset, seed)
-    fixed = {
+    settings = {
         "rows": n,
         "components": components,
         "seed": seed,
         "starts": starts,
         "regularisation": regularisation,
+        "subset": subset,
     }
-    settings = {name: str(value) for name, value in (fixed | {"subset": subset}).items()}
     path = None if checkpoint is None else Path(checkpoint)
-    saved = Checkpoint(path, shard, centre, scale, settings)
+    told = {name: str(value) for name, value in settings.items()}
+    saved = Checkpoint(path, shard, centre, scale, told)
     rule = EmRule(iterations, tolerance, regularisation)
 
     def try_start(begun: FitProgress) -> Fit:

@@ -1,8 +1,8 @@
 """Convex parts of a mesh for the simulator, decomposed once and cached.
 
 Simulators replace a mesh by its convex hull, which would make a jug solid. CoACD cuts the mesh into
-convex parts. Its measure of concavity is relative to the size of the mesh, so parts of a wide thing
-with thin walls may bulge by several walls. Such a mesh is cut finer.
+convex parts. Its measure of concavity is relative to the size of the mesh. Parts of a wide thing
+with thin walls may therefore bulge by several walls. Such a mesh is cut finer.
 """
 
 import dataclasses
@@ -58,8 +58,8 @@ def convex_parts(
     """Return convex parts [m] whose union approximates a closed mesh; a convex mesh gives a single
     part.
 
-    Parts of which more than 5 % of the surface lies farther than 1 mm outside the mesh
-    (`CUT.bulge`) are cut again, finer, at most twice.
+    Parts bulge if more than 5 % of their surface lies farther than 1 mm outside the mesh
+    (`CUT.bulge`). The mesh is then cut again, finer, at most twice.
 
     Args:
         mesh: the closed mesh [m], or its file.

@@ -23,7 +23,7 @@ class MujocoScene(SimulatedScene):
     """A simulated scene in MuJoCo: table, object and hand.
 
     A step runs the second half of MuJoCo's step (forces to state) before its first half (state to
-    poses and contacts), so that poses are current between steps.
+    poses and contacts). So poses are current between steps.
     """
 
     def __init__(self, spec: SceneSpec) -> None:

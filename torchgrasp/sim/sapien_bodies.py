@@ -15,8 +15,7 @@ Settings that differ from SAPIEN's defaults:
 * Convex parts are cooked at a larger scale, and the foot of a finely faceted part is a shape of its
   own.
 
-The arguments `sapien` and `physx` are the modules that `import_sapien` returns; a `material` is
-PhysX's material of a surface, with its friction.
+A `material` is PhysX's material of a surface, with its friction.
 """
 
 import dataclasses
@@ -44,25 +43,28 @@ from torchgrasp.sim.scene_spec import (
 class BodyNumbers:
     """Settings of PhysX for bodies."""
 
-    contact_offset: float = 0.002  # distance [m] at which contacts are made before shapes touch
-    # iterations of the solver for positions in each step; with more, held objects creep less
+    contact_offset: float = 0.002
+    """Distance [m] at which contacts are made before shapes touch."""
     iterations: int = 32
-    scale: float = 0.01  # ratio of true to cooked lengths; PhysX drops vertices within 0.7 mm
-    hull: int = 129  # most vertices of a hull of which PhysX keeps all, as it keeps 255 faces
-    foot: int = 100  # number of lowest vertices of a larger hull that make a shape of their own
+    """Iterations of the solver for positions in each step; with more, held objects creep less."""
+    scale: float = 0.01
+    """Ratio of true to cooked lengths; PhysX drops vertices within 0.7 mm."""
+    hull: int = 129
+    """Most vertices of a hull of which PhysX keeps all, as it keeps 255 faces."""
+    foot: int = 100
+    """Number of lowest vertices of a larger hull that make a shape of their own."""
 
 
 BODIES = BodyNumbers()
 
 
-def open_world(
-    sapien: Any, physx: Any, gravity: float, timestep: float, patches: bool = False
-) -> tuple[Any, Any]:
+def open_world(gravity: float, timestep: float, patches: bool) -> tuple[Any, Any]:
     """Return an empty physics system and its scene.
 
     `gravity` is in m/s^2, `timestep` in seconds. `patches` selects the solver TGS, which knows
     contact patches.
     """
+    sapien, physx = import_sapien()
     physx.set_scene_config(
         gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=patches, enable_pcm=True
     )
@@ -78,11 +80,18 @@ def open_world(
     return system, scene
 
 
-def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) -> None:
+def surface_of(friction: float) -> Any:
+    """Return the material of a surface with a coefficient of `friction`, on which nothing bounces."""
+    _, physx = import_sapien()
+    return physx.PhysxMaterial(friction, friction, 0.0)
+
+
+def place(scene: Any, name: str, body: Any, height: float = 0.0) -> None:
     """Add an entity with one body and a `name` to the scene.
 
     The body's origin is at a `height` [m] on the world's z axis.
     """
+    sapien, _ = import_sapien()
     entity = sapien.Entity()
     entity.name = name
     entity.add_component(body)
@@ -90,12 +99,13 @@ def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) ->
     scene.add_entity(entity)
 
 
-def table(sapien: Any, physx: Any, material: Any, spec: SceneSpec) -> Any:
+def table(material: Any, spec: SceneSpec) -> Any:
     """Return the body of the table, of the given `material`; its origin is at its height.
 
     It is a half space, or with an edge the surface of a box, in triangles. On a solid box a rocking
     object would gain energy until it falls over.
     """
+    sapien, physx = import_sapien()
     body = physx.PhysxRigidStaticComponent()
     if spec.edge is None:
         top = physx.PhysxCollisionShapePlane(material)
@@ -118,15 +128,14 @@ def table(sapien: Any, physx: Any, material: Any, spec: SceneSpec) -> Any:
     return body
 
 
-def rigid_body(
-    sapien: Any, physx: Any, material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: float
-) -> Any:
+def rigid_body(material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: float) -> Any:
     """Return a dynamic body of uniform density, made of convex hulls.
 
     `spec` gives mass and inertia, `hulls` the vertices (v, 3) [m] of each hull, and `patch` [m] the
     radius of contact patches. PhysX drops vertices within 0.7 mm of the hull of the others.
     Therefore it gets hulls a hundred times as large.
     """
+    sapien, physx = import_sapien()
     scale = BODIES.scale
     body = physx.PhysxRigidDynamicComponent()
     for vertices in (some for hull in hulls for some in split_hull(hull)):

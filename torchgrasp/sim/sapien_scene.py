@@ -12,6 +12,7 @@ from torchgrasp.sim.sapien_bodies import (
     open_world,
     place,
     rigid_body,
+    surface_of,
     table,
 )
 from torchgrasp.sim.scene_spec import WRIST_JOINT, SceneSpec
@@ -37,22 +38,16 @@ class SapienScene(SimulatedScene):
     def __init__(self, spec: SceneSpec) -> None:
         super().__init__(spec)
         self._calls: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
-        sapien, physx = import_sapien()
-        self.system, self.scene = open_world(
-            sapien, physx, spec.gravity, spec.timestep, spec.patch > 0.0
-        )
-        slick = physx.PhysxMaterial(spec.body_friction, spec.body_friction, 0.0)
+        self.system, self.scene = open_world(spec.gravity, spec.timestep, spec.patch > 0.0)
+        slick = surface_of(spec.body_friction)
         # PhysX averages the coefficients of two bodies.
-        both = 2 * spec.friction - spec.body_friction
-        grip = physx.PhysxMaterial(both, both, 0.0)
+        grip = surface_of(2 * spec.friction - spec.body_friction)
         if spec.table:
-            place(sapien, self.scene, "table", table(sapien, physx, slick, spec), spec.table_height)
+            place(self.scene, "table", table(slick, spec), spec.table_height)
         solids = zip((spec.body, *spec.neighbours), spec.hulls, strict=True)
-        bodies = [
-            rigid_body(sapien, physx, slick, body, hulls, spec.patch) for body, hulls in solids
-        ]
+        bodies = [rigid_body(slick, body, hulls, spec.patch) for body, hulls in solids]
         for k, body in enumerate(bodies):
-            place(sapien, self.scene, "neighbour" if k else "object", body)
+            place(self.scene, "neighbour" if k else "object", body)
         self.body, *self.neighbours = bodies
         self.hand = mounted_hand(self.scene, grip, spec)
         links = {link.name: link for link in self.hand.links}

@@ -111,18 +111,17 @@ def measure_grasps(
     pressing = task.pressing(lifted)
     greatest = greatest_force(hand, grasps, forces).to(points).nan_to_num(0.0)
     strength = torch.minimum(greatest, greatest.new_tensor(pressing or GRIP))
-    numbers = MEASURES
     frictions = conditions.frictions[0].tolist()
     masses = conditions.masses[0].tolist()
-    slipping = [numbers.slippery * friction for friction in frictions]
+    slipping = [MEASURES.slippery * friction for friction in frictions]
     needed = _force_for(contacts, forces, center, slipping, masses, lifted)
     moved = touch_moved(hand, body.field, grasps, forces)
     everywhere = center if center.ndim == 1 else center.repeat(len(moved.touched), 1)
     both = [*frictions, *slipping]
     there = _force_for(moved.contacts, moved.forces, everywhere, both, masses, lifted)
-    there = there.unflatten(2, moved.touched.shape).where(moved.touched, numbers.most_force)
-    strength = strength.clamp_min(numbers.least_force)
-    logs = torch.log(strength / there).clamp(-numbers.most_spare, numbers.most_spare)
+    there = there.unflatten(2, moved.touched.shape).where(moved.touched, MEASURES.most_force)
+    strength = strength.clamp_min(MEASURES.least_force)
+    logs = torch.log(strength / there).clamp(-MEASURES.most_spare, MEASURES.most_spare)
     spare, slippery = logs.split(len(frictions))  # (n, m, d, g)
     found: dict[str, Tensor | float] = {
         "force needed": needed,
@@ -155,8 +154,8 @@ def measure_grasps(
 def weight_about(
     points: Float[Tensor, "g f 3"], center: Float[Tensor, "*g 3"], mass: float
 ) -> Float[Tensor, "g 6"]:
-    """Return the weight of a mass [kg] as a force [N] and a torque [N m] about the centroid of each
-    contact set.
+    """Return the weight of a mass [kg] about the centroid of each contact set: force [N], then
+    torque [N m].
 
     The contacts (g, f, 3) [m] and the centre of mass are in an upright frame.
     """
@@ -201,21 +200,20 @@ def _force_for(
     masses: Sequence[float],
     lifted: bool,
 ) -> Float[Tensor, "n m g"]:
-    """Return the force [N] of the strongest finger at which no contact slides under the load, for n
-    friction coefficients and m masses [kg].
+    """Return the force [N] of the strongest finger at which no contact slides under the load. There
+    is one for each of n friction coefficients, m masses [kg] and g grasps.
 
     The load is the weight of the mass if the object is `lifted`, and otherwise a pull in any
     direction.
     """
-    numbers = MEASURES
-    weight = numbers.gravity * masses[0] if lifted else 0.0
-    pull = 0.0 if lifted else numbers.pull * masses[0]
+    weight = MEASURES.gravity * masses[0] if lifted else 0.0
+    pull = 0.0 if lifted else MEASURES.pull * masses[0]
     load = center.new_tensor([0.0, 0.0, -weight])
     force = carrying_force(contacts, forces, center, frictions, load, pull)
     # the force is proportional to the mass
     ratios = force.new_tensor(masses)[:, None] / masses[0]
     force = torch.where(ratios == 1, force[:, None], ratios * force[:, None])
-    return force.clamp(numbers.least_force, numbers.most_force)  # infinite: no force does
+    return force.clamp(MEASURES.least_force, MEASURES.most_force)  # infinite: no force does
 
 
 def _normal_deviation(
@@ -229,11 +227,9 @@ def _normal_deviation(
     slope = norm(mean[:, 1:])
     tangents = torch.stack(across(normal), -1)
     tangential = tangents.mT @ covariance[:, 1:, 1:] @ tangents
+    # the larger eigenvalue of each matrix (2, 2)
     one, other = tangential.diagonal(dim1=1, dim2=2).unbind(1)
-    largest = (
-        ((one + other) / 2 + torch.hypot((one - other) / 2, tangential[:, 0, 1]))
-        .clamp_min(0)
-        .sqrt()
-    )
+    variance = (one + other) / 2 + torch.hypot((one - other) / 2, tangential[:, 0, 1])
+    largest = variance.clamp_min(0).sqrt()
     largest, slope = (x.view(points.shape[:2]) for x in (largest, slope))
     return spread(shape.std_factor, largest) * largest / slope

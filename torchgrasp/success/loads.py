@@ -104,8 +104,8 @@ def carrying_force(
 def greatest_force(
     hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> Float[Tensor, "g"]:
-    """Return for each of g grasps the largest factor (no unit) on the contact `forces` [N] at which
-    no drive exceeds its greatest torque.
+    """Return the largest factor (no unit) on the contact `forces` [N] at which no drive exceeds its
+    greatest torque, for each of g grasps.
 
     The forces are in the frame of the grasps. Those that are NaN give NaN.
     """

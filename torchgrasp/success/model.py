@@ -73,17 +73,15 @@ class SuccessModel(Value):
     def depth(self) -> int:
         """The number of steps from the root to the deepest leaf of all trees."""
         reached = torch.zeros(len(self.feature), 1, dtype=torch.int64, device=self.feature.device)
-        depth = 0
         trees = row_numbers(self.feature)[:, None]
-        while bool(
-            (
-                (below := self.children[trees, reached].flatten(1))
-                != reached.repeat_interleave(2, 1)
-            ).any()
-        ):
+        depth = 0
+        while True:
+            below = self.children[trees, reached].flatten(1)
+            # a leaf is its own child
+            if not bool((below != reached.repeat_interleave(2, 1)).any()):
+                return depth
             reached = below
             depth = depth + 1
-        return depth
 
     def interval(self, log_odds: Float[Tensor, "*g"]) -> Float[Tensor, "*g 2"]:
         """Return the least and the greatest share of grasps with these log-odds that held in

@@ -9,8 +9,8 @@ loss of at most 1 - alpha. So the least bound is taken at which
 
     sum_f l_f + (1 - alpha) <= 0.
 
-For a loss that falls with the bound, the promise then holds in the mean over n families and a new
-one, whatever n is. This loss falls but for noise.
+If the loss falls with the bound, the promise holds in the mean over n families and a new one. This
+is true for every n, and this loss falls but for noise.
 """
 
 import functools

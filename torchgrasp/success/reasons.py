@@ -15,6 +15,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import (
     CAUSES,
+    FEATURES,
     GRIP,
     UNCARRIED,
     carries_weight,
@@ -113,26 +114,24 @@ def explain_success(
     supported = supported_share(conditions)
     model = load_success_model(features.device)
     known = model.mean_log_odds(features, weights)
-    first = 0
+    units = {name: unit for names in CAUSES.values() for name, unit in names.items()}
+    means = (weights @ features[:, 0]).tolist()
+    values = {name: _say(x, units[name]) for name, x in zip(FEATURES, means, strict=True)}
     told = list[Cost]()
-    units = [pair for names in CAUSES.values() for pair in names.items()]
-    values = {
-        name: _say(float(x), unit)
-        for (name, unit), x in zip(units, (weights @ features[:, 0]).tolist(), strict=True)
-    }
     for cause, names in CAUSES.items():
+        columns = [FEATURES.index(name) for name in names]
         usual = features.clone()
-        usual[..., first : first + len(names)] = model.usual[first : first + len(names)]
+        usual[..., columns] = model.usual[columns]
         gain = float(model.mean_log_odds(usual, weights) - known)
         sentence = SENTENCES[cause].format_map(values)
         if cause == "load" and not carried:
             gain += UNCARRIED
             sentence += "; no forces of the fingers carry the weight"
         told.append(Cost(cause, gain, sentence))
-        first += len(names)
     lower = [cost for cost in sorted(told, key=lambda cost: -cost.log_odds) if cost.log_odds > 0]
     if not 0 < supported < 1 - ROUNDING:
         return tuple(lower[:MOST])
+    # the task is told in any case, with what no trial supports of it
     given = told[-1]
     unknown = f"no trial supports {1 - supported:.0%} of these frictions and masses"
     said = given._replace(sentence=f"{given.sentence}; {unknown}")
@@ -186,8 +185,5 @@ def _say(value: float, unit: str) -> str:
     """Return a number with its unit as text: millimetres and degrees for metres and radians."""
     scales = {"m": (1000.0, " mm"), "rad": (math.degrees(1.0), " degrees"), "1": (1.0, "")}
     factor, shown = scales.get(unit, (1.0, f" {unit}"))
-    return (
-        f"{value * factor:.2g}{shown}"
-        if abs(value * factor) < 10
-        else f"{value * factor:.0f}{shown}"
-    )
+    number = value * factor
+    return f"{number:.2g}{shown}" if abs(number) < 10 else f"{number:.0f}{shown}"

@@ -91,9 +91,9 @@ class GraspTask(Value):
     def pressing(self, lifted: bool) -> float:
         """Return the normal force [N] of the strongest finger.
 
-        This is the field `force`. If that is None, it is 4 N in pulls and 0 in a lift, where the
-        hand presses as much as the felt load needs. `lifted` says whether the task is a lift, as
-        `lifts` returns it.
+        This is the field `force`. If that is None, it is 4 N in pulls and 0 in a lift. In a lift
+        the hand presses as much as the felt load needs. `lifted` says whether the task is a lift,
+        as `lifts` returns it.
         """
         return self.force or (0.0 if lifted else 4.0)
 
@@ -241,22 +241,27 @@ def loads_of(
             else apply(upright_from_obj, resist.point.to(center)[None])[0]
         )
     else:
-        axes = torch.eye(3, dtype=torch.float64)
-        signs = [*itertools.product((-1.0, 1.0), repeat=3)]
-        corners = torch.tensor(signs, dtype=torch.float32) / math.sqrt(3)
-        # The convex hull of these vectors contains the unit ball.
-        around = TASKS.around * torch.cat([corners, axes, -axes])  # (14, 3)
-        weight = real([[0.0, 0.0, -TASKS.gravity * mass]])
-        # Without the vector that points up, the hull contains the part of the ball within 120
-        # degrees of straight down.
-        loads = {
-            "lift": weight,
-            "pour": TASKS.gravity * mass * around[around[:, 2] < TASKS.upward],
-            "push": weight + TASKS.push * around,
-        }
         names = (resist,) if isinstance(resist, str) else resist
+        loads = _named_loads(mass)
         force = torch.cat([loads[name] for name in names]).to(center)
         force = force if table else force @ upright_from_obj[:3, :3].T
         torque = torch.zeros_like(force)
         point = center
     return torch.cat([force, torque + torch.linalg.cross(point.expand_as(force), force)], -1)
+
+
+def _named_loads(mass: float) -> dict[str, Float[Tensor, "w 3"]]:
+    """Return the forces [N] of each named load on an object of a `mass` [kg], with z up."""
+    axes = torch.eye(3, dtype=torch.float64)
+    signs = [*itertools.product((-1.0, 1.0), repeat=3)]
+    corners = torch.tensor(signs, dtype=torch.float32) / math.sqrt(3)
+    # The convex hull of these vectors contains the unit ball.
+    around = TASKS.around * torch.cat([corners, axes, -axes])  # (14, 3)
+    weight = real([[0.0, 0.0, -TASKS.gravity * mass]])
+    # Without the vector that points up, the hull contains the part of the ball within 120 degrees
+    # of straight down.
+    return {
+        "lift": weight,
+        "pour": TASKS.gravity * mass * around[around[:, 2] < TASKS.upward],
+        "push": weight + TASKS.push * around,
+    }

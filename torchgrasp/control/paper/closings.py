@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.balance import grasp_map, internal_forces
+from torchgrasp.control.finger_forces import coupled_stiffness
 from torchgrasp.control.holding import RAMP, held_forces, regulate
 from torchgrasp.control.law import (
     MAX_SPEED,
@@ -25,7 +26,7 @@ from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.tactile import STILL, Observation, smooth
 from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
-from torchgrasp.geometry.linalg import limit_norm
+from torchgrasp.geometry.linalg import limit_norm, norm
 
 STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (Sec. 6.5).
 # stiffness of the virtual frame [N/m, N m/rad]
@@ -138,7 +139,7 @@ class PositionClosing:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         reference = self.reference
         error = self.aim - reference.contact_points(observation.tips)
-        arrived = torch.linalg.vector_norm(error, dim=-1) < POSITION.arrived
+        arrived = norm(error) < POSITION.arrived
         self.stopped = self.stopped | arrived | (observation.tactile.reading >= STOP_FORCE)
         self.done = bool(self.stopped.all())
         self.integral = self.integral + period * error
@@ -209,7 +210,7 @@ def shared_forces(
     """
     shared = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0]
     forces = shared.unflatten(-1, (3, 3))
-    largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
+    largest = norm(forces).amax(-1)
     return forces * (most / torch.maximum(largest, most))[..., None, None]
 
 
@@ -233,7 +234,7 @@ def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """Return the lengths [m] of the sides (0, 1), (1, 2) and (2, 0) of the triangle of `points`
     [m].
     """
-    return torch.linalg.vector_norm(points.roll(-1, dims=-2) - points, dim=-1)
+    return norm(points.roll(-1, dims=-2) - points)
 
 
 class Impedance:
@@ -267,7 +268,7 @@ class Impedance:
         if springs is None:
             springs = torch.full((3,), GRASP_STIFFNESS).to(observation.tips)
         self.springs = springs
-        self.stiffness = (self.coupling**2 * reference.kp[:, None]).sum(0)
+        self.stiffness = coupled_stiffness(reference.hand, reference.kp)
         forces, self.strength = held_forces(reference, observation)
         self.frame = rigid(torch.eye(3).to(observation.tips), observation.tips.mean(0))
         self.rest = self._frame(observation.tips)
@@ -317,7 +318,7 @@ class Impedance:
         """
         frame = self._frame(tips)
         desired = self.raised * self.factor * self.desired @ frame[:3, :3].T
-        most = torch.linalg.vector_norm(desired, dim=-1).amax()  # the wrench lifts no finger
+        most = norm(desired).amax()  # the wrench lifts no finger
         springs = spring_forces(tips, self.lengths, self.springs)
         return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
 

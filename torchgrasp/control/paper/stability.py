@@ -23,6 +23,7 @@ from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError
 from torchgrasp.foundation.rules import LEAST, Positive, Range
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.mixture import check_compatible
@@ -57,7 +58,7 @@ def state_of(
 
 def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """Return the distances [m] of three fingertips' centres `tips` [m] from their centroid."""
-    return torch.linalg.vector_norm(tips - tips.mean(-2, keepdim=True), dim=-1)
+    return norm(tips - tips.mean(-2, keepdim=True))
 
 
 @checked
