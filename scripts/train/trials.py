@@ -51,14 +51,7 @@ from torchgrasp.success.task import Conditions
 from torchgrasp.values.planning import Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of
-from train.tasks import (
-    ORDINARY_FRICTION,
-    PULL,
-    Task,
-    draw_friction,
-    draw_ordinary,
-    draw_task,
-)
+from train.tasks import ORDINARY_FRICTION, PULL, Task, draw_friction, draw_ordinary, draw_task
 
 HANDS = ("allegro", "barrett", "leap", "shadow")
 """Hands of the trials; each body is tried with one of them."""
