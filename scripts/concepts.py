@@ -6,6 +6,7 @@ python scripts/concepts.py [--out docs]
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -44,6 +45,7 @@ from torchgrasp.geometry.linalg import dot, unit
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Wedge
 
 HEIGHT = 0.07
 """Height [m] of the slice through the jug: its belly and its handle."""
@@ -51,6 +53,9 @@ INK = "#1f2933"
 SEEN = "#d64545"
 TRUE = "#147d64"
 """Colours of lines, of what the camera saw and of the true outline."""
+ARROW = {"arrowstyle": "-|>", "linewidth": 1.6}
+FRICTION = 0.8
+"""Arrows of all pictures; friction of the contacts that close, and of those that do not."""
 
 
 def draw_band(path: Path) -> None:
@@ -95,35 +100,22 @@ def draw_contacts(axes: Axes, degrees: tuple[float, ...]) -> None:
     says of them.
     """
     radius = 0.033
-    spec = ContactSpec(friction=0.8)
+    spec = ContactSpec(friction=FRICTION)
     angle = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
     normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)[None]
     proof = certify(Contacts(radius * normals, normals), spec)
-    axes.add_patch(plt.Circle((0, 0), 1e3 * radius, fill=False, color=INK, linewidth=1.6))
-    for friction, color in ((spec.friction, "#fff3c4"), (spec.planned_friction, "#f7c948")):
+    axes.add_patch(Circle((0, 0), 1e3 * radius, fill=False, color=INK, linewidth=1.6))
+    places = (1e3 * radius * normals[0, :, :2]).tolist()
+    for friction, color in ((FRICTION, "#fff3c4"), (spec.planned_friction, "#f7c948")):
         half = math.degrees(math.atan(friction))
-        for turn in degrees:
-            at = (
-                1e3
-                * radius
-                * np.array([math.cos(math.radians(turn)), math.sin(math.radians(turn))])
-            )
-            axes.add_patch(
-                matplotlib.patches.Wedge(at, 24, turn + 180 - half, turn + 180 + half, color=color)
-            )
-    for turn in degrees:
-        at = 1e3 * radius * np.array([math.cos(math.radians(turn)), math.sin(math.radians(turn))])
-        axes.annotate(
-            "",
-            at * 0.55,
-            at * 1.45,
-            arrowprops={"arrowstyle": "-|>", "color": SEEN, "linewidth": 1.6},
-        )
-    said = (
-        "closed: any push is resisted"
-        if bool(proof.closed)
-        else "not closed: it is pushed out downwards"
-    )
+        for (x, y), turn in zip(places, degrees, strict=True):
+            axes.add_patch(Wedge((x, y), 24, turn + 180 - half, turn + 180 + half, color=color))
+    for x, y in places:
+        start = (0.55 * x, 0.55 * y)
+        axes.annotate("", start, (1.45 * x, 1.45 * y), arrowprops=ARROW | {"color": SEEN})
+    said = "not closed: it is pushed out downwards"
+    if bool(proof.closed):
+        said = "closed: any push is resisted"
     axes.set_title(f"{said}\nmargin {float(proof.margin):+.3f}", fontsize=9)
     axes.set(aspect="equal", xlim=(-55, 55), ylim=(-55, 55), xticks=[], yticks=[])
     axes.set_frame_on(False)
@@ -164,7 +156,8 @@ def draw_drag(path: Path) -> None:
     x = torch.tensor([1.0, 0.0, 0.0])
     spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.15 * x, x))
     plan = plan_edge_grasps(cloud, hand, spec, starts=100)
-    drag, grasp = plan.drag, plan.grasps.best
+    drag = plan.drag
+    grasp = plan.grasps.best
     assert drag is not None
     shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
     way = drag.displacement.numpy()
@@ -180,7 +173,7 @@ def draw_drag(path: Path) -> None:
     ]
     corners = np.concatenate([slab.vertices, *(s.vertices for solids in hands for s in solids)])
     camera = frame_camera(corners, (0.3, -1.0, 0.1), size=SHOT)
-    begin, end = project(np.stack([0 * way, way]) + FRONT, camera)
+    begin, end = project(np.stack([0 * way, way]) + FRONT, camera).tolist()
     shots = []
     for panel, solids in zip(panels, hands, strict=True):
         canvas = Canvas()
@@ -199,7 +192,7 @@ def draw_drag(path: Path) -> None:
         axes.imshow(shot)
         axes.set(xlim=(left, right), ylim=(bottom, top))
         if panel.title.startswith("2"):
-            axes.annotate("", end, begin, arrowprops={"arrowstyle": "-|>", "linewidth": 1.6})
+            axes.annotate("", end, begin, arrowprops=ARROW)
         axes.set_title(panel.title, fontsize=11, color=INK)
         axes.set_axis_off()
     figure.savefig(path, pil_kwargs={"quality": 88})
@@ -237,8 +230,7 @@ def draw_sources(path: Path) -> None:
     """
     figure, all_axes = plt.subplots(2, 3, figsize=(9.0, 5.0), dpi=110, layout="constrained")
     for axes, source in zip(all_axes.flat, list_sources(), strict=True):
-        low, high = source.sizes[0], source.sizes[-1]
-        fine = np.linspace(low, high, 31)
+        fine = np.linspace(source.sizes[0], source.sizes[-1], 31)
         predicted = [float(source.predicted(x)) for x in fine]
         axes.plot(source.scale * fine, predicted, color=INK, label="hold_probability")
         shares = [float((1 - LAW.cdf(source.drawn(x))).mean()) for x in source.sizes]
@@ -257,7 +249,8 @@ def list_sources() -> list[Source]:
     """Return the sources of uncertainty at the contacts of the jug's shipped Barrett grasp."""
     contacts = load_shipped_grasp("jug", "barrett").contacts
     contacts = Contacts(contacts.points.double(), contacts.normals.double())
-    points, normals = contacts.points, contacts.normals
+    points = contacts.points
+    normals = contacts.normals
     generator = torch.Generator().manual_seed(0)
     three = torch.randn(2, DRAWN, 1, 3, generator=generator, dtype=torch.float64)
     each = torch.randn(2, DRAWN, *points.shape[1:], generator=generator, dtype=torch.float64)
@@ -269,8 +262,17 @@ def list_sources() -> list[Source]:
     def moved(v: torch.Tensor) -> torch.Tensor:
         return critical_friction(points + along(v), normals.expand_as(v))
 
-    def turned(v: torch.Tensor) -> torch.Tensor:
-        return critical_friction(points.expand_as(v), unit(normals + along(v)))
+    def slid(std: float) -> torch.Tensor:
+        return moved(std * each[0])
+
+    def tilted(std: float) -> torch.Tensor:
+        return critical_friction(points.expand_as(each[1]), unit(normals + along(std * each[1])))
+
+    def shifted(std: float) -> torch.Tensor:
+        return moved((std * three[0]).expand_as(each[0]))
+
+    def spun(std: float) -> torch.Tensor:
+        return moved(torch.linalg.cross((std * three[1]).expand_as(each[0]), arms))
 
     weight = CarriedWeight(0.25, points[0].mean(0), press=5.0)
 
@@ -291,38 +293,16 @@ def list_sources() -> list[Source]:
 
     millimetres = (0.0, 0.002, 0.004, 0.006, 0.008)
     angles = (0.0, 0.03, 0.06, 0.09, 0.12)
-    degrees = math.degrees(1.0)
+    hold = functools.partial(hold_probability, contacts, LAW)
+    turns = math.degrees(1.0)
+    masses = (0.0, 0.1, 0.2, 0.3, 0.4)
     return [
         *list_friction(contacts),
-        Source(
-            "finger placement: std [mm]",
-            1e3,
-            millimetres,
-            lambda x: hold_probability(contacts, LAW, placement=x),
-            lambda x: moved(x * each[0]),
-        ),
-        Source(
-            "normals: std [deg]",
-            degrees,
-            angles,
-            lambda x: hold_probability(contacts, LAW, tilt=x),
-            lambda x: turned(x * each[1]),
-        ),
-        Source(
-            "object's place: std [mm]",
-            1e3,
-            millimetres,
-            lambda x: hold_probability(contacts, LAW, shift=x),
-            lambda x: moved((x * three[0]).expand_as(each[0])),
-        ),
-        Source(
-            "object's rotation: std [deg]",
-            degrees,
-            angles,
-            lambda x: hold_probability(contacts, LAW, turn=x),
-            lambda x: moved(torch.linalg.cross((x * three[1]).expand_as(each[0]), arms)),
-        ),
-        Source("mass around 0.25 kg: width [kg]", 1.0, (0.0, 0.1, 0.2, 0.3, 0.4), heavier, weighed),
+        Source("finger placement: std [mm]", 1e3, millimetres, lambda x: hold(placement=x), slid),
+        Source("normals: std [deg]", turns, angles, lambda x: hold(tilt=x), tilted),
+        Source("object's place: std [mm]", 1e3, millimetres, lambda x: hold(shift=x), shifted),
+        Source("object's rotation: std [deg]", turns, angles, lambda x: hold(turn=x), spun),
+        Source("mass around 0.25 kg: width [kg]", 1.0, masses, heavier, weighed),
     ]
 
 

@@ -114,7 +114,9 @@ def household(
         cloud = partial_view(body.mesh, camera, seed=k)
         place = folder / body.name
         place.mkdir(parents=True, exist_ok=True)
-        write_file(place / "mesh.ply", body.mesh.export(file_type="ply"))
+        content = body.mesh.export(file_type="ply")
+        assert isinstance(content, bytes)
+        write_file(place / "mesh.ply", content)
         save_cloud(cloud, place / "view0_noisy.ply")
         pose = {"T_object_camera": camera.tolist()}
         entries[body.name] = {"family": body.family, "views": {"view0": pose}}

@@ -6,6 +6,7 @@ import dataclasses
 import statistics
 from pathlib import Path
 
+import numpy as np
 import torch
 import trimesh
 from scipy.spatial import KDTree
@@ -170,7 +171,7 @@ def measure_floor(seen: torch.Tensor, measured: torch.Tensor) -> float:
     assert view.normals is not None
     away, rows = KDTree(view.points.numpy()).query(measured.numpy())
     both = away < UNSEEN
-    rows = rows[both]
+    rows = np.asarray(rows)[both]
     offset = measured[both] - view.points[rows]
     height = (offset * view.normals[rows]).sum(1).abs()
     return 1e3 * float(height.median()) if len(height) else float("nan")
