@@ -1,14 +1,11 @@
 #!/usr/bin/env python
-"""Draw the pictures of docs/concepts.md, docs/uncertainty.md and docs/edge.md: a slice through a band
-of uncertainty, contacts with and without closure, what each uncertainty costs, and a drag.
+"""Draw the pictures of docs/concepts.md and docs/edge.md: a slice through a band of uncertainty,
+contacts with and without closure, and a drag.
 
 python scripts/concepts.py [--out docs]
 """
 
-import dataclasses
-import functools
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,15 +16,11 @@ import trimesh
 import tyro
 
 from torchgrasp import (
-    CarriedWeight,
     Contacts,
     ContactSpec,
-    Distribution,
     Plane,
     certify,
-    critical_friction,
     fit_shape,
-    hold_probability,
     load_hand,
     load_object,
     plan_edge_grasps,
@@ -36,11 +29,7 @@ from torchgrasp.app.report.canvas import OBJECT, Camera, Canvas, frame_camera
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import add_solids
 from torchgrasp.cloud import look_at, partial_view
-from torchgrasp.contacts.critical import least_balance
-from torchgrasp.contacts.form_closure import centre_and_radius, with_torque
-from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.geometry.frames import rigid
-from torchgrasp.geometry.linalg import dot, unit
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -206,124 +195,6 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     return np.stack([SHOT[0] / 2 - scale * right / back, SHOT[1] / 2 + scale * up / back], -1)
 
 
-LAW = Distribution.between(0.1, 0.6)
-"""Friction in the pictures of other uncertainties."""
-DRAWN = 4000
-"""Random draws for each dot."""
-
-
-class Source(NamedTuple):
-    """An uncertainty: its name on the axis, its sizes, the probability in closed form, and frictions
-    that random draws of it need.
-    """
-
-    axis: str
-    scale: float
-    sizes: tuple[float, ...]
-    predicted: Callable[[float], torch.Tensor]
-    drawn: Callable[[float], torch.Tensor]
-
-
-def draw_sources(path: Path) -> None:
-    """Draw the probability that the contacts of a shipped grasp close, over the size of each
-    uncertainty: in closed form, and by random draws.
-    """
-    figure, all_axes = plt.subplots(2, 3, figsize=(9.0, 5.0), dpi=110, layout="constrained")
-    for axes, source in zip(all_axes.flat, list_sources(), strict=True):
-        fine = np.linspace(source.sizes[0], source.sizes[-1], 31)
-        predicted = [float(source.predicted(x)) for x in fine]
-        axes.plot(source.scale * fine, predicted, color=INK, label="hold_probability")
-        shares = [float((1 - LAW.cdf(source.drawn(x))).mean()) for x in source.sizes]
-        label = f"{DRAWN} random draws"
-        sizes = source.scale * np.array(source.sizes)
-        axes.scatter(sizes, shares, color=SEEN, s=16, zorder=3, label=label)
-        axes.set(xlabel=source.axis, ylim=(0.5, 1.02))
-    for axes in all_axes[:, 0]:
-        axes.set_ylabel("probability")
-    all_axes[0, 0].legend(frameon=False, loc="lower left", fontsize=8)
-    figure.savefig(path)
-    plt.close(figure)
-
-
-def list_sources() -> list[Source]:
-    """Return the sources of uncertainty at the contacts of the jug's shipped Barrett grasp."""
-    contacts = load_shipped_grasp("jug", "barrett").contacts
-    contacts = Contacts(contacts.points.double(), contacts.normals.double())
-    points = contacts.points
-    normals = contacts.normals
-    generator = torch.Generator().manual_seed(0)
-    three = torch.randn(2, DRAWN, 1, 3, generator=generator, dtype=torch.float64)
-    each = torch.randn(2, DRAWN, *points.shape[1:], generator=generator, dtype=torch.float64)
-    arms = points - points.mean(1, keepdim=True)
-
-    def along(v: torch.Tensor) -> torch.Tensor:
-        return v - dot(v, normals, keepdim=True) * normals
-
-    def moved(v: torch.Tensor) -> torch.Tensor:
-        return critical_friction(points + along(v), normals.expand_as(v))
-
-    def slid(std: float) -> torch.Tensor:
-        return moved(std * each[0])
-
-    def tilted(std: float) -> torch.Tensor:
-        return critical_friction(points.expand_as(each[1]), unit(normals + along(std * each[1])))
-
-    def shifted(std: float) -> torch.Tensor:
-        return moved((std * three[0]).expand_as(each[0]))
-
-    def spun(std: float) -> torch.Tensor:
-        return moved(torch.linalg.cross((std * three[1]).expand_as(each[0]), arms))
-
-    weight = CarriedWeight(0.25, points[0].mean(0), press=5.0)
-
-    def heavier(width: float) -> torch.Tensor:
-        mass = Distribution.between(0.25 - width / 2, 0.25 + width / 2) if width else 0.25
-        return hold_probability(contacts, LAW, weight=dataclasses.replace(weight, mass=mass))
-
-    def weighed(width: float) -> torch.Tensor:
-        mass = 0.25 + width * (torch.rand(DRAWN, generator=generator, dtype=torch.float64) - 0.5)
-        centre, radius = centre_and_radius(points)
-        force = torch.zeros(DRAWN, 3, dtype=torch.float64)
-        force[:, 2] = -9.81 * mass / weight.press
-        load = with_torque(force, ((weight.center - centre[:, 0]) / radius[:, 0]).expand(DRAWN, 3))
-        many, outward = (x.expand(DRAWN, -1, -1) for x in (points, normals))
-        rows, balance = least_balance(many, outward, load)
-        needed = torch.full((DRAWN,), torch.inf, dtype=torch.float64)
-        return needed.index_put((rows,), balance.friction)
-
-    millimetres = (0.0, 0.002, 0.004, 0.006, 0.008)
-    angles = (0.0, 0.03, 0.06, 0.09, 0.12)
-    hold = functools.partial(hold_probability, contacts, LAW)
-    turns = math.degrees(1.0)
-    masses = (0.0, 0.1, 0.2, 0.3, 0.4)
-    return [
-        *list_friction(contacts),
-        Source("finger placement: std [mm]", 1e3, millimetres, lambda x: hold(placement=x), slid),
-        Source("normals: std [deg]", turns, angles, lambda x: hold(tilt=x), tilted),
-        Source("object's place: std [mm]", 1e3, millimetres, lambda x: hold(shift=x), shifted),
-        Source("object's rotation: std [deg]", turns, angles, lambda x: hold(turn=x), spun),
-        Source("mass around 0.25 kg: width [kg]", 1.0, masses, heavier, weighed),
-    ]
-
-
-def list_friction(contacts: Contacts) -> list[Source]:
-    """Return the source friction: intervals around the mean of `LAW`."""
-    needed = critical_friction(contacts.points, contacts.normals)
-    uniform = torch.rand(DRAWN, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-
-    def law(width: float) -> Distribution:
-        return Distribution.between(LAW.mean - width / 2, LAW.mean + width / 2)
-
-    def drawn(width: float) -> torch.Tensor:
-        """Return frictions that hold in `LAW` as often as the drawn ones exceed what is needed."""
-        held = LAW.mean + width * (uniform - 0.5) > needed
-        return torch.where(held, 0.0, torch.inf)
-
-    widths = (0.01, 0.2, 0.4, 0.6, 0.7)
-    axis = f"friction around {LAW.mean:g}: width"
-    return [Source(axis, 1.0, widths, lambda x: hold_probability(contacts, law(x)), drawn)]
-
-
 def main(out: Path = Path(__file__).parents[1] / "docs") -> None:
     """Draw the pictures.
 
@@ -333,7 +204,6 @@ def main(out: Path = Path(__file__).parents[1] / "docs") -> None:
     torch.set_num_threads(1)
     draw_band(out / "concepts_band.png")
     draw_certificates(out / "concepts_certificate.png")
-    draw_sources(out / "uncertainty_sources.png")
     draw_drag(out / "edge.jpg")
 
 
