@@ -5,8 +5,6 @@
 
 * headline: lifts, low, pulls, region, rendered, real, pace: what README says; --publish writes it
 
-* gpu: clouds, launches: many clouds at once, also without a GPU
-
 * plan: pace, uncertain: time to grasps, uncertain friction
 
 * scene: real, rooms, target: supports and things in depth images, a given thing among others
@@ -23,7 +21,7 @@ import tyro
 from benchmarks.common import Options, measure
 from benchmarks.headline.page import write_headline
 
-SUBJECTS = ("close", "gpu", "headline", "plan", "scene")
+SUBJECTS = ("close", "headline", "plan", "scene")
 
 
 def command(subject: str) -> Callable[[Options], None]:

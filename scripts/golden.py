@@ -104,18 +104,18 @@ def see(name: str, k: int) -> Any:
     if k == 0:
         return shipped.view
     pose = look_at(60.0 * k, 35.0, target=shipped.mesh)
-    depth, labels = render_depth(
-        [trimesh.Trimesh(shipped.mesh.vertices, shipped.mesh.faces)], pose, seed=k
-    )
+    mesh = trimesh.Trimesh(shipped.mesh.vertices, shipped.mesh.faces)
+    depth, labels = render_depth([mesh], pose, seed=k)
     return cloud_from_depth(depth, INTRINSICS, mask=labels == 1, camera_pose=pose)
 
 
-def plan(name: str, k: int, hand: str, mode: str) -> str:
+def plan(name: str, k: int, hand: str, mode: Any) -> str:
     """Return the hash of the grasps that are planned on a view."""
     from torchgrasp import ContactSpec, load_hand, plan_grasps
 
     spec = (ContactSpec.paper if mode == "paper" else ContactSpec)(table=0.0)
-    return hash_grasps(plan_grasps(see(name, k), load_hand(hand), spec, STARTS[mode], 0, mode=mode))
+    asked = (see(name, k), load_hand(hand), spec, STARTS[mode], 0)
+    return hash_grasps(plan_grasps(*asked, mode=mode))
 
 
 def close(name: str, hand: str, how: str) -> str:
@@ -130,22 +130,14 @@ def close(name: str, hand: str, how: str) -> str:
     if "sensor" in options:
         options["sensor"] = SensorModel(options["sensor"])
     thing = load_object(name)
-    surface = (
-        surface_field(fit_shape(thing.view, table=0.0)) if options.pop("seen", False) else None
-    )
+    known: dict[str, Any] = {"parts": thing.parts, "surface": None}
+    if options.pop("seen", False):
+        known["surface"] = surface_field(fit_shape(thing.view, table=0.0))
     spec = TrialSpec(lift_height=0.02, hold_time=0.1, **options)
     grasp = load_shipped_grasp(name, hand)
-    found = close_hand(
-        grasp, load_hand(hand), thing.mesh, spec, error=error, parts=thing.parts, surface=surface
-    )
-    return digest(
-        found.status.name,
-        found.time,
-        found.forces,
-        found.object_pose,
-        found.hand_pose,
-        found.joints,
-    )
+    found = close_hand(grasp, load_hand(hand), thing.mesh, spec, error=error, **known)
+    moved = (found.object_pose, found.hand_pose, found.joints)
+    return digest(found.status.name, found.time, found.forces, *moved)
 
 
 def lift(k: int) -> str:
@@ -163,12 +155,9 @@ def export(name: str, hand: str) -> str:
     from torchgrasp.export import format_graspgen, format_grasps, format_keyframes
 
     grasps = load_shipped_grasp(name, hand)
-    the_hand = load_hand(hand)
-    return digest(
-        format_grasps(the_hand, grasps),
-        format_keyframes(the_hand, grasps),
-        format_graspgen(grasps, "object.obj"),
-    )
+    model = load_hand(hand)
+    texts = (format_grasps(model, grasps), format_keyframes(model, grasps))
+    return digest(*texts, format_graspgen(grasps, "object.obj"))
 
 
 def run_command(words: str) -> str:
@@ -192,10 +181,7 @@ def run_command(words: str) -> str:
 
 JOBS: dict[str, tuple[Callable[..., str], list[tuple[Any, ...]]]] = {
     "plan": (plan, [(*view, hand, mode) for view in VIEWS for hand in HANDS for mode in MODES]),
-    "close": (
-        close,
-        [(name, hand, how) for how in CLOSINGS for name in OBJECTS[:2] for hand in HANDS],
-    ),
+    "close": (close, [(x, hand, how) for how in CLOSINGS for x in OBJECTS[:2] for hand in HANDS]),
     "lift": (lift, [(k,) for k in range(8)]),
     "export": (export, [(name, hand) for name in OBJECTS[:2] for hand in HANDS]),
     "command": (run_command, [(words,) for words in COMMANDS]),
@@ -227,15 +213,12 @@ def compute_all(parts: Iterable[str], every: int, workers: int) -> dict[str, str
 def main() -> int:
     """Save hashes, or compare them."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--save", type=Path, help="file that the hashes are written to")
-    parser.add_argument("--against", type=Path, help="file of hashes to compare with")
-    parser.add_argument(
-        "--only", nargs="+", choices=JOBS, default=list(JOBS), help="parts; by default all"
-    )
-    parser.add_argument(
-        "--every", type=int, default=1, help="compute only each so many-th hash of a part"
-    )
-    parser.add_argument("--workers", type=int, default=2, help="processes")
+    add = parser.add_argument
+    add("--save", type=Path, help="file that the hashes are written to")
+    add("--against", type=Path, help="file of hashes to compare with")
+    add("--only", nargs="+", choices=JOBS, default=list(JOBS), help="parts; by default all")
+    add("--every", type=int, default=1, help="compute only each so many-th hash of a part")
+    add("--workers", type=int, default=2, help="processes")
     given = parser.parse_args()
     found = compute_all(given.only, given.every, given.workers)
     for name in sorted(name for name, value in found.items() if "Error" in value or ":" in value):

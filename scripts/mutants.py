@@ -46,35 +46,32 @@ class Mutant(NamedTuple):
 
 def all_mutants(folder: str) -> list[Mutant]:
     """Return every mutant of a folder of the library."""
-    from cosmic_ray.ast import ast_nodes, get_ast
-    from cosmic_ray.plugins import get_operator
+    from cosmic_ray import ast, plugins  # pyright: ignore[reportMissingImports]
 
     found = []
     for path in sorted((ROOT / "torchgrasp" / folder).rglob("*.py")):
-        tree = get_ast(path.read_text())
+        tree = ast.get_ast(path.read_text())
         module = path.relative_to(ROOT).as_posix()
         for name in NAMES if path.name != "__init__.py" else ():
-            operator = get_operator(name)()
-            count = sum(len(list(operator.mutation_positions(node))) for node in ast_nodes(tree))
+            operator = plugins.get_operator(name)()
+            nodes = ast.ast_nodes(tree)
+            count = sum(len(list(operator.mutation_positions(node))) for node in nodes)
             found += [Mutant(module, name, k) for k in range(count)]
     return found
 
 
 def try_mutant(copy: Path, mutant: Mutant, limit: float) -> dict[str, object]:
     """Return whether the tests notice a mutant, and the changed lines."""
-    from cosmic_ray.mutating import mutate_code
-    from cosmic_ray.plugins import get_operator
+    from cosmic_ray import mutating, plugins  # pyright: ignore[reportMissingImports]
 
     path = copy / mutant.module
     before = path.read_text()
-    after = mutate_code(before, get_operator(mutant.operator)(), mutant.occurrence)
+    operator = plugins.get_operator(mutant.operator)()
+    after = mutating.mutate_code(before, operator, mutant.occurrence)
     assert after is not None
+    pairs = zip(before.split("\n"), after.split("\n"), strict=False)
     lines = [
-        (k, old.strip(), new.strip())
-        for k, (old, new) in enumerate(
-            zip(before.split("\n"), after.split("\n"), strict=False), start=1
-        )
-        if old != new
+        (k, old.strip(), new.strip()) for k, (old, new) in enumerate(pairs, start=1) if old != new
     ]
     path.write_text(after)
     try:
@@ -92,9 +89,10 @@ def run_tests(copy: Path, module: str, limit: float) -> bool:
     environment = os.environ | {"PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1"}
     words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow"]
     for tests in [own] * own.is_file() + [folder]:
+        command = [*words, str(tests)]
         try:
             done = subprocess.run(
-                [*words, str(tests)], cwd=copy, env=environment, capture_output=True, timeout=limit
+                command, cwd=copy, env=environment, capture_output=True, timeout=limit
             )
         except subprocess.TimeoutExpired:
             return True
@@ -144,12 +142,8 @@ def main(
             for result in pool.map(work, [mutant for mutant in chosen if mutant not in tried]):
                 done.append(result)
                 out.write_text(json.dumps(done, indent=1))
-                print(
-                    "killed  " if result["killed"] else "SURVIVED",
-                    result["module"],
-                    result["line"],
-                    flush=True,
-                )
+                said = "killed  " if result["killed"] else "SURVIVED"
+                print(said, result["module"], result["line"], flush=True)
     survivors = [one for one in done if not one["killed"]]
     print(f"{len(survivors)} of {len(done)} mutants survived")
 

@@ -2,10 +2,9 @@
 """Build wheel and sdist of the last commit, and try the wheel in an empty environment of every
 Python there is.
 
-python scripts/package.py                                 all Pythons that are found, torch as pip
-finds it python scripts/package.py --python python3.10 python3.13  these alone; none after --python:
-it only builds python scripts/package.py --torch-index INDEX             torch from there, such as
-PyTorch's index of CPU wheels
+    python scripts/package.py                                 with all Pythons that are found
+    python scripts/package.py --python python3.10 python3.13  with these; with none it only builds
+    python scripts/package.py --torch-index INDEX             torch from there, as PyTorch's own
 
 Nothing but Python, its venv module and git is needed. Environments are made one at a time and
 removed.
@@ -27,32 +26,24 @@ NEWEST = 14
 MOST_BYTES = 3_000_000
 """Of the wheel: what is downloaded each time."""
 CLOUD = "torchgrasp/data/assets/jug/view.ply"
-"""The cloud of the main job."""
+JOB = "grasp cloud.ply --hand allegro --starts 200 --out mine"
+"""The cloud of the main job, and the job."""
 
 
 def main() -> int:
     """Build, check and try; the exit code is 0 if all is well."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=ROOT / "out/package",
-        help="folder of wheel, sdist, package.json",
-    )
-    parser.add_argument(
-        "--python", nargs="*", help="interpreters; by default all of PATH and pyenv from 3.10 on"
-    )
-    parser.add_argument(
-        "--torch-index", help="index that torch is taken from; by default where pip looks"
-    )
+    shown = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=shown)
+    add = parser.add_argument
+    folder = ROOT / "out/package"
+    add("--out", type=Path, default=folder, help="folder of wheel, sdist, package.json")
+    add("--python", nargs="*", help="interpreters; by default all of PATH and pyenv from 3.10 on")
+    add("--torch-index", help="index that torch is taken from; by default where pip looks")
     asked = parser.parse_args()
     if run("git", "status", "--porcelain", cwd=ROOT).strip():
         print("package: what is not committed is left out")
-    with tempfile.TemporaryDirectory(
-        prefix="package-"
-    ) as folder:  # runs of torchgrasp clear away "torchgrasp-*"
+    # runs of torchgrasp clear away "torchgrasp-*"
+    with tempfile.TemporaryDirectory(prefix="package-") as folder:
         work = Path(folder)
         wheel = build(work, asked.out.resolve())
         pythons = find_pythons() if asked.python is None else asked.python
@@ -65,19 +56,13 @@ def run(*words: object, cwd: Path, codes: tuple[int, ...] = (0,), most: int = 36
     """Run a command without the surrounding environment, and return what it printed; end here where
     it fails.
     """
-    clean = {
-        name: value
-        for name, value in os.environ.items()
-        if name not in ("PYTHONPATH", "PYTHONHOME")
-    }
-    done = subprocess.run(
-        [str(x) for x in words], cwd=cwd, env=clean, capture_output=True, text=True, timeout=most
-    )
+    own = ("PYTHONPATH", "PYTHONHOME")
+    clean = {name: value for name, value in os.environ.items() if name not in own}
+    command = [str(x) for x in words]
+    done = subprocess.run(command, cwd=cwd, env=clean, capture_output=True, text=True, timeout=most)
     if done.returncode not in codes:
         shown = "\n".join((done.stdout + done.stderr).splitlines()[-30:])
-        sys.exit(
-            f"package: {' '.join(str(x) for x in words)} ended with {done.returncode}:\n{shown}"
-        )
+        sys.exit(f"package: {' '.join(command)} ended with {done.returncode}:\n{shown}")
     return done.stdout
 
 
@@ -97,14 +82,12 @@ def build(work: Path, out: Path) -> Path:
     made = [out / direct.name, next(out.glob(f"{direct.name.split('-py3')[0]}.tar.gz"))]
     if made[0].read_bytes() != direct.read_bytes():
         sys.exit(
-            "package: the wheel of the sdist is not the wheel of the tree: the sdist lacks something"
+            "package: the wheel of the sdist is not that of the tree: the sdist lacks something"
         )
     run(python, "-m", "twine", "check", "--strict", *made, cwd=work)
     for path in made:
-        print(
-            f"{path.name}: {path.stat().st_size / 1e6:.2f} MB, twine check --strict passed",
-            flush=True,
-        )
+        megabytes = path.stat().st_size / 1e6
+        print(f"{path.name}: {megabytes:.2f} MB, twine check --strict passed", flush=True)
     if direct.stat().st_size > MOST_BYTES:
         sys.exit(f"package: the wheel has more than {MOST_BYTES / 1e6:.0f} MB")
     return made[0]
@@ -117,11 +100,10 @@ def find_pythons() -> list[str]:
     for minor in range(OLDEST, NEWEST + 1):
         own = sorted(pyenv.glob(f"3.{minor}.*/bin/python"))
         python = str(own[-1]) if own else shutil.which(f"python3.{minor}")
-        if (
-            python
-            and subprocess.run([python, "-c", "import ensurepip"], capture_output=True).returncode
-            == 0
-        ):
+        if python is None:
+            continue
+        tried = subprocess.run([python, "-c", "import ensurepip"], capture_output=True)
+        if tried.returncode == 0:
             found.append(python)
     return found or [sys.executable]
 
@@ -145,18 +127,7 @@ def try_wheel(work: Path, wheel: Path, interpreter: str, index: str | None) -> d
     version, torch, cuda = run(python, "-c", ask, cwd=empty).split()
     gigabytes = size_of(environment / "lib") / 1e9
     shutil.copy(ROOT / CLOUD, empty / "cloud.ply")
-    told = run(
-        command,
-        "grasp",
-        "cloud.ply",
-        "--hand",
-        "allegro",
-        "--starts",
-        200,
-        "--out",
-        "mine",
-        cwd=empty,
-    )
+    told = run(command, *JOB.split(), cwd=empty)
     missing = run(command, "doctor", cwd=empty, codes=(1,))
     if "sapien: pip install 'torchgrasp[sim]'" not in missing:
         sys.exit(f"package: doctor does not say how to install the simulator:\n{missing}")

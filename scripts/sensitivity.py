@@ -42,14 +42,8 @@ FACTORS = (1.2, 0.8)
 TOGETHER = 32
 """Most numbers that are moved at once, where few have an effect."""
 WAYS = (
-    "guarded, grip",
-    "uncertainty",
-    "impedance",
-    "paper",
-    "paper position",
-    "torque",
-    "binary",
-    "mujoco",
+    *("guarded, grip", "uncertainty", "impedance", "paper", "paper position"),
+    *("torque", "binary", "mujoco"),
 )
 """Ways to close a hand, of those of `golden.py`."""
 
@@ -188,27 +182,18 @@ def find_probabilities() -> str:
     """Return the hash of the probabilities of closure and of holding of shipped grasps."""
     import golden
 
-    from torchgrasp import (
-        CarriedWeight,
-        Distribution,
-        closure_probability,
-        critical_friction,
-        fit_shape,
-        hold_probability,
-        load_object,
-    )
+    import torchgrasp as tg
     from torchgrasp.data.shipped import load_shipped_grasp
 
     contacts = load_shipped_grasp("jug", "allegro").contacts
-    shape = fit_shape(load_object("jug").view, table=0.0)
-    friction = Distribution.between(0.2, 1.0)
-    weight = CarriedWeight(Distribution.between(0.1, 0.5), contacts.points[0].mean(0), press=4.0)
-    errors = {"placement": 0.002, "tilt": 0.05, "weight": weight}
-    closed = closure_probability(shape, contacts)
-    held = hold_probability(contacts, friction, **errors)
-    return golden.digest(
-        closed.probability, critical_friction(contacts.points, contacts.normals), held
-    )
+    shape = tg.fit_shape(tg.load_object("jug").view, table=0.0)
+    friction = tg.Distribution.between(0.2, 1.0)
+    mass = tg.Distribution.between(0.1, 0.5)
+    weight = tg.CarriedWeight(mass, contacts.points[0].mean(0), press=4.0)
+    closed = tg.closure_probability(shape, contacts).probability
+    needed = tg.critical_friction(contacts.points, contacts.normals)
+    held = tg.hold_probability(contacts, friction, placement=0.002, tilt=0.05, weight=weight)
+    return golden.digest(closed, needed, held)
 
 
 def plan_scene() -> str:
@@ -229,9 +214,8 @@ def plan_object(objects: Any, name: str) -> str:
     from torchgrasp.data import read_view
 
     view = read_view(objects, name, "view0")
-    return golden.hash_grasps(
-        plan_grasps(view, load_hand("allegro"), ContactSpec(table=0.0), 80, 0)
-    )
+    grasps = plan_grasps(view, load_hand("allegro"), ContactSpec(table=0.0), 80, 0)
+    return golden.hash_grasps(grasps)
 
 
 def compute(numbers: Sequence[Number], factor: float, case: Case) -> str:

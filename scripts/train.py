@@ -29,21 +29,8 @@ from train.trials import trials
 from torchgrasp.foundation.errors import GraspError
 
 if __name__ == "__main__":
-    commands = {
-        x.__name__: x
-        for x in (
-            paper_model,
-            success,
-            promise,
-            judge_fresh,
-            occupancy,
-            bands,
-            household,
-            trials,
-            objects,
-            golden,
-        )
-    }
+    models = (paper_model, success, promise, judge_fresh, occupancy, bands)
+    commands = {x.__name__: x for x in (*models, household, trials, objects, golden)}
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands, prog="train.py", description="Files that torchgrasp ships."

@@ -52,26 +52,24 @@ def fig4(out: Path, seed: int = 0) -> None:
         whole = fit_shape(clouds[0], budget=BUDGET, support="paper", seed=seed)
         paper = fit_shape(clouds[1], support="paper", seed=seed)
         default = fit_shape(clouds[1], seed=seed, table=0.0)
-        shapes = [whole, paper, default]
+        shapes = (whole, paper, default)
         surfaces = [extract_surface(shape, 64) for shape in shapes]
         arrows = [observed_normals(shape) for shape in shapes]
         for kind, surface in zip(("whole", "paper", "default"), surfaces, strict=True):
             std = 1e3 * surface.std_m
-            print(
-                f"{name:10}{kind:9} std [mm]: median {std.median():.1f}, 99 % {std.quantile(0.99):.1f}"
-            )
+            told = f"median {std.median():.1f}, 99 % {std.quantile(0.99):.1f}"
+            print(f"{name:10}{kind:9} std [mm]: {told}")
         scenes.append((thing, clouds, surfaces, arrows))
     # One scale for all, the most certain 80 % of each: the least certain bulges would leave all
     # else in one colour.
-    most = 1e3 * max(
-        float(surface.std_m.quantile(0.8)) for _, _, surfaces, _ in scenes for surface in surfaces
-    )
+    drawn = [surface for _, _, surfaces, _ in scenes for surface in surfaces]
+    most = 1e3 * max(float(surface.std_m.quantile(0.8)) for surface in drawn)
     columns = []
     for thing, clouds, surfaces, arrows in scenes:
         eye = rotated(view_of(thing.view), TURN)
         corners = np.asarray(thing.mesh.vertices)
-        drawn = list(zip(surfaces, arrows, strict=True))
-        column = ((clouds[0], None), drawn[0], (clouds[1], None), *drawn[1:])
+        shapes = list(zip(surfaces, arrows, strict=True))
+        column = ((clouds[0], None), shapes[0], (clouds[1], None), *shapes[1:])
         columns.append([draw(what, normals, most, corners, eye) for what, normals in column])
     titles = {(row, 0): title for row, title in enumerate(ROWS)}
     save_sheet(out / "fig4.png", list(zip(*columns, strict=True)), titles, most)
@@ -102,9 +100,8 @@ def draw(
         vertices = what.vertices.numpy()
         faces = what.faces.numpy()
         normals = what.normals.numpy()
-        canvas.add_mesh(
-            vertices, faces, map_colors(1e3 * what.std_m.numpy() / most, "viridis"), normals
-        )
+        colors = map_colors(1e3 * what.std_m.numpy() / most, "viridis")
+        canvas.add_mesh(vertices, faces, colors, normals)
         corners = np.concatenate([corners, vertices])
     if arrows:
         length = ARROW * float(np.linalg.norm(np.ptp(corners, axis=0)))

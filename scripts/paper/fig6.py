@@ -75,16 +75,11 @@ def draw_selection(curves: dict[str, tuple[BicCurve, CrossValidation]], out: Pat
             error = values.std(1) / torch.tensor(values.shape[1]).sqrt()
             axis.errorbar(crossed.components, values.mean(1), error, fmt="o-", ms=3, capsize=2)
             axis.set_ylabel(label)
+        paper = PUBLISHED[name]
+        least = int(curve.components[curve.bic.argmin()])
         for axis in row:
-            axis.axvline(
-                PUBLISHED[name], color="grey", lw=0.8, ls="--", label=f"paper: {PUBLISHED[name]}"
-            )
-            axis.axvline(
-                int(curve.components[curve.bic.argmin()]),
-                color="#d62728",
-                lw=0.8,
-                label="least BIC",
-            )
+            axis.axvline(paper, color="grey", lw=0.8, ls="--", label=f"paper: {paper}")
+            axis.axvline(least, color="#d62728", lw=0.8, label="least BIC")
             axis.set_xlabel("Gaussians")
             axis.set_title(name)
             axis.grid(alpha=0.3)

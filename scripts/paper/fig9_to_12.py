@@ -79,17 +79,12 @@ def grasps(out: Path, starts: int = 1000, seed: int = 0, only: tuple[str, ...] =
     pairs = [found for both in taken for t in both if (found := unlike_pair(t)) is not None]
     widest = sorted(pairs, key=lambda pair: -pair[3])[:2]
     save([[(t, one), (t, two)] for t, one, two, _ in widest], out / "fig9.png")
-    save(
-        [found for allegro, barrett in taken if (found := shared_triple(allegro, barrett.hand))][
-            :2
-        ],
-        out / "fig10.png",
-    )
+    triples = [shared_triple(allegro, barrett.hand) for allegro, barrett in taken]
+    save([triple for triple in triples if triple][:2], out / "fig10.png")
     for k, number in ((1, 11), (0, 12)):
-        shown = [
-            (both[k], index) for both in taken for index in range(min(SHOWN, len(both[k].grasps)))
-        ]
-        save([[one] for one in shown], out / f"fig{number}.png")
+        shown = [both[k] for both in taken]
+        rows = [[(x, index)] for x in shown for index in range(min(SHOWN, len(x.grasps)))]
+        save(rows, out / f"fig{number}.png")
 
 
 def take(name: str, hand: Hand, starts: int, seed: int) -> Taken:
@@ -97,10 +92,12 @@ def take(name: str, hand: Hand, starts: int, seed: int) -> Taken:
     first.
     """
     stages = dict[str, Any]()
-    note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
-    planned = plan_grasps(
-        load_object(name).view, hand, SPEC, starts, seed, mode="paper", observer=note
-    )
+
+    def note(stage: str, _: str, value: Any) -> None:
+        stages[stage] = value
+
+    view = load_object(name).view
+    planned = plan_grasps(view, hand, SPEC, starts, seed, mode="paper", observer=note)
     return Taken(hand, extract_surface(stages["shape"]), planned[planned.status == Status.OK])
 
 
@@ -127,19 +124,16 @@ def shared_triple(first: Taken, other: Hand) -> list[tuple[Taken, int]]:
     if not len(contacts):
         return []
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.plane)
-    problem = GraspProblem(
-        other, contacts, first.grasps.certificate, world, surface.vertices.mean(0)
-    )
+    centre = surface.vertices.mean(0)
+    problem = GraspProblem(other, contacts, first.grasps.certificate, world, centre)
     mixture = load_mixture(other.urdf_path.parent / "paper.safetensors")
-    tried = solve_as_paper(
-        problem, query_mixture(other, contacts, mixture, n_seeds=1, max_energy=PAPER_ENERGY)
-    )
+    seeds = query_mixture(other, contacts, mixture, n_seeds=1, max_energy=PAPER_ENERGY)
+    tried = solve_as_paper(problem, seeds)
     good = tried[tried.status == Status.OK]
     if not len(good):
         return []
-    gap = torch.linalg.vector_norm(
-        contacts.points.mean(1) - good.contacts.points[0].mean(0), dim=-1
-    )
+    apart = contacts.points.mean(1) - good.contacts.points[0].mean(0)
+    gap = torch.linalg.vector_norm(apart, dim=-1)
     return [(first, int(gap.argmin())), (Taken(other, surface, good), 0)]
 
 
@@ -175,9 +169,8 @@ def draw(taken: Taken, index: int, eye: Direction) -> Image.Image:
     canvas = Canvas()
     contacts = grasp.contacts
     vertices = surface.vertices.numpy()
-    canvas.add_mesh(
-        vertices, surface.faces.numpy(), OBJECT, surface.normals.numpy(), transparent=True
-    )
+    normals = surface.normals.numpy()
+    canvas.add_mesh(vertices, surface.faces.numpy(), OBJECT, normals, transparent=True)
     joints = hand.expand_joints(grasp.joints[0])
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     for solid in solids:

@@ -46,42 +46,30 @@ def table3(out: Path, seed: int = 0) -> None:
         seed: of every draw.
     """
     torch.set_num_threads(1)
-    print(
-        f"{'':10}{'setting':9}{'cloud':9}{'points':>7}{'filter s':>10}{'shape s':>9}   the paper's"
-    )
+    head = f"{'setting':9}{'cloud':9}{'points':>7}{'filter s':>10}{'shape s':>9}"
+    print(f"{'':10}{head}   the paper's")
     rows: list[dict[str, Any]] = []
     for name in list_objects():
         thing = load_object(name)
         whole = sample_whole(thing.mesh, seed)
         part = thing.view
-        settings: tuple[tuple[str, str, Callable[[], ShapeGP]], ...] = (
-            (
-                "paper",
-                "whole",
-                partial(fit_shape, whole, budget="sure", support="paper", seed=seed),
-            ),
-            (
-                "paper",
-                "partial",
-                partial(fit_shape, part, budget="sure", support="paper", seed=seed),
-            ),
-            ("default", "partial", partial(fit_shape, part, seed=seed, table=0.0)),
-        )
-        for setting, cloud, fit in settings:
+        as_paper = partial(fit_shape, budget="sure", support="paper", seed=seed)
+        fits: dict[tuple[str, str], Callable[[], ShapeGP]] = {
+            ("paper", "whole"): partial(as_paper, whole),
+            ("paper", "partial"): partial(as_paper, part),
+            ("default", "partial"): partial(fit_shape, part, seed=seed, table=0.0),
+        }
+        for (setting, cloud), fit in fits.items():
             shape, filtering = timed(fit)
             _, modelling = timed(partial(condition_again, shape))
             row = {"object": name, "setting": setting, "cloud": cloud, "points": len(shape.x)}
             rows.append(row | {"filter_s": filtering, "shape_s": modelling})
             label, points, first, second = PUBLISHED[name]
             beside = f"   {label} {points}, {first} s, {second} s" if cloud == "whole" else ""
-            print(
-                f"{name:10}{setting:9}{cloud:9}{len(shape.x):7}{filtering:10.2f}{modelling:9.3f}{beside}",
-                flush=True,
-            )
-    write_file(
-        out / "table3.json",
-        json.dumps({"seed": seed, "rows": rows, "published": PUBLISHED}, indent=1),
-    )
+            measured = f"{len(shape.x):7}{filtering:10.2f}{modelling:9.3f}"
+            print(f"{name:10}{setting:9}{cloud:9}{measured}{beside}", flush=True)
+    content = {"seed": seed, "rows": rows, "published": PUBLISHED}
+    write_file(out / "table3.json", json.dumps(content, indent=1))
 
 
 def sample_whole(mesh: trimesh.Trimesh, seed: int) -> PointCloud:

@@ -3,6 +3,7 @@
 import itertools
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,9 @@ PUBLISHED = {
     "jug": ("Jug", 914, "26.52 +- 13.58", "0.38 +- 0.75"),
 }
 """The paper's object like ours: grasps out of 1000, seconds a start, quality [cm], all at 0.03."""
+SHAPES: dict[str, dict[str, Any]] = {"paper": {"support": "paper"}, "default": {"table": 0.0}}
+SPECS: dict[str, Callable[..., ContactSpec]] = {"paper": ContactSpec.paper, "default": ContactSpec}
+"""How the paper and torchgrasp by itself see an object, and what they ask of contacts."""
 TILE = (340, 330)
 """Width and height of one picture of Fig. 5 [pixels]."""
 SHOWN = 4
@@ -62,24 +66,16 @@ def table4(out: Path, starts: int = 1000, seed: int = 0) -> None:
         seed: of the draw of starts.
     """
     torch.set_num_threads(1)
-    print(
-        f"{'':10}{'setting':9}{'S':>5}{'grasps':>8}{'ms a start':>12}{'Q [cm]':>16}{'probability':>13}   the paper's"
-    )
+    head = f"{'setting':9}{'S':>5}{'grasps':>8}{'ms a start':>12}{'Q [cm]':>16}{'probability':>13}"
+    print(f"{'':10}{head}   the paper's")
     rows: list[dict[str, Any]] = []
     for name in list_objects():
-        view = load_object(name).view
-        shapes = {
-            "paper": fit_shape(view, support="paper", seed=seed),
-            "default": fit_shape(view, seed=seed, table=0.0),
-        }
-        for setting, shape in shapes.items():
+        for setting, given in SHAPES.items():
+            shape = fit_shape(load_object(name).view, seed=seed, **given)
             for threshold in THRESHOLDS:
-                spec = ContactSpec.paper(max_variance=threshold, table=0.0)
-                if setting == "default":
-                    spec = ContactSpec(max_variance=threshold, table=0.0)
-                row = {"object": name, "setting": setting, "threshold": threshold} | count(
-                    shape, spec, starts, seed
-                )
+                spec = SPECS[setting](max_variance=threshold, table=0.0)
+                row: dict[str, Any] = {"object": name, "setting": setting, "threshold": threshold}
+                row |= count(shape, spec, starts, seed)
                 rows.append(row)
                 print(line(row), flush=True)
     content = {"starts": starts, "seed": seed, "rows": rows, "published": PUBLISHED}
@@ -131,35 +127,25 @@ def fig5(out: Path, starts: int = 300, seed: int = 0) -> None:
         seed: of the draw of starts.
     """
     scenes: list[tuple[str, Surface, Contacts]] = []
-    for name, chain in itertools.product(list_objects(), ("paper", "default")):
-        as_paper = chain == "paper"
-        view = load_object(name).view
-        spec = ContactSpec.paper(table=0.0) if as_paper else ContactSpec(table=0.0)
-        shape = (
-            fit_shape(view, seed=seed, support="paper")
-            if as_paper
-            else fit_shape(view, seed=seed, table=0.0)
-        )
+    for name, setting in itertools.product(list_objects(), SHAPES):
+        spec = SPECS[setting](table=0.0)
+        shape = fit_shape(load_object(name).view, seed=seed, **SHAPES[setting])
         plan = plan_contacts(shape, spec, starts, seed)
         contacts = plan.contacts[plan.status == Status.OK]
         contacts = contacts[certify(contacts, spec).closed]
         likely = closure_probability(shape, contacts, spec, seed=seed).probability
-        better = -contacts.variance.sum(1) if as_paper and contacts.variance is not None else likely
+        better = likely
+        if setting == "paper" and contacts.variance is not None:
+            better = -contacts.variance.sum(1)
         shown = unlike(contacts[better >= better.median()], SHOWN)
-        scenes.append((f"{name}, {chain}", extract_surface(shape, 64), shown))
-        print(
-            f"{name:10}{chain:9}{len(contacts):5} certified, closure probable to {likely.mean():.2f}, "
-            f"drawn with std [mm] up to {1e3 * shown.require_std().max():.1f}",
-            flush=True,
-        )
+        scenes.append((f"{name}, {setting}", extract_surface(shape, 64), shown))
+        most = 1e3 * shown.require_std().max()
+        text = f"{len(contacts):5} certified, closure probable to {likely.mean():.2f}"
+        print(f"{name:10}{setting:9}{text}, drawn with std [mm] up to {most:.1f}", flush=True)
     most = 1e3 * max(float(surface.std_m.quantile(0.9)) for _, surface, _ in scenes)
     rows = [[draw(surface, shown[k], most) for _, surface, shown in scenes] for k in range(SHOWN)]
-    save_sheet(
-        out / "fig5.png",
-        rows,
-        {(0, column): name for column, (name, *_) in enumerate(scenes)},
-        most,
-    )
+    captions = {(0, column): name for column, (name, *_) in enumerate(scenes)}
+    save_sheet(out / "fig5.png", rows, captions, most)
 
 
 def unlike(contacts: Contacts, count: int) -> Contacts:

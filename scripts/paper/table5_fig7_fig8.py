@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from paper.sheet import render_tile, save_sheet
@@ -73,15 +73,12 @@ def measure_errors(name: str, n: int, seed: int, touching: Touching = "rolled") 
     hand = load_hand(name)
     mixture = load_mixture(name)
     if str(seed) == mixture.meta["seed"]:
-        raise SystemExit(
-            f"--seed {seed}: the model was fitted to these postures; choose another seed"
-        )
-    samples = sample_configurations(
-        hand, n, seed, sampling="uniform" if touching == "uniform" else "grasping"
-    )
-    codes = (
-        encode_fingertips(*hand.fingertips(samples.joints)) if touching == "middle" else samples.q
-    )
+        raise SystemExit(f"--seed {seed}: the model was fitted to these postures; choose another")
+    sampling = "uniform" if touching == "uniform" else "grasping"
+    samples = sample_configurations(hand, n, seed, sampling=sampling)
+    codes = samples.q
+    if touching == "middle":
+        codes = encode_fingertips(*hand.fingertips(samples.joints))
     predicted = mixture.joints(codes).clamp(hand.lower, hand.upper)
     return Errors(hand, samples.joints, predicted, (predicted - samples.joints).abs())
 
@@ -94,7 +91,7 @@ def nearest_code_error(name: str, n: int, seed: int) -> float:
     known = sample_configurations(hand, n, seed + 1, sampling="grasping")
     asked = sample_configurations(hand, min(n, QUERIES), seed, sampling="grasping")
     scale = known.q.std(0)
-    nearest = cKDTree((known.q / scale).numpy()).query((asked.q / scale).numpy(), k=NEIGHBOURS)[1]
+    nearest = KDTree((known.q / scale).numpy()).query((asked.q / scale).numpy(), k=NEIGHBOURS)[1]
     median = known.joints[torch.from_numpy(nearest)].median(1).values
     return float((median - asked.joints).abs().mean())
 
@@ -109,31 +106,23 @@ def table5(out: Path, n: int = 100_000, seed: int = 1) -> None:
         seed: of their draw.
     """
     errors = measure_errors("barrett", n, seed)
-    others = {
-        kind: measure_errors("barrett", n, seed, kind).error.mean(0)
-        for kind in ("middle", "uniform")
-    }
+    touching: tuple[Touching, ...] = ("middle", "uniform")
+    others = {kind: measure_errors("barrett", n, seed, kind).error.mean(0) for kind in touching}
     cases = errors.error[errors.cases()].T
     mean = errors.error.mean(0)
     spread = errors.error.std(0)
     head = "".join(f"{f'case {k + 1}':>8}" for k in range(len(CASES)))
     print(f"{'joint':12}{head}{'overall':>17}   the paper's{head}{'overall':>17}")
     for k, joint in enumerate(errors.hand.joint_names):
-        ours = (
-            "".join(f"{float(x):8.3f}" for x in cases[k])
-            + f"{f'{mean[k]:.3f} +- {spread[k]:.3f}':>17}"
-        )
-        paper = PUBLISHED["cases"][k]
-        (theirs, deviation) = PUBLISHED["overall"][k]
-        print(
-            f"{joint:12}{ours}   {f'J{k + 1}':11}"
-            + "".join(f"{x:8.3g}" for x in paper)
-            + f"{f'{theirs} +- {deviation}':>17}"
-        )
+        ours = "".join(f"{float(x):8.3f}" for x in cases[k])
+        ours += f"{f'{mean[k]:.3f} +- {spread[k]:.3f}':>17}"
+        paper = "".join(f"{x:8.3g}" for x in PUBLISHED["cases"][k])
+        theirs, deviation = PUBLISHED["overall"][k]
+        paper += f"{f'{theirs} +- {deviation}':>17}"
+        print(f"{joint:12}{ours}   {f'J{k + 1}':11}{paper}")
     for kind, error in others.items():
-        print(
-            f"{kind:12}{', '.join(f'{x:.3f}' for x in error.tolist())}; mean {float(error.mean()):.3f}"
-        )
+        each = ", ".join(f"{x:.3f}" for x in error.tolist())
+        print(f"{kind:12}{each}; mean {float(error.mean()):.3f}")
     theirs = np.mean([m for m, _ in PUBLISHED["overall"]])
     print(f"mean over joints {float(errors.error.mean()):.3f}; the paper's {theirs:.3f}")
     print(f"cases: the postures at {', '.join(f'{c:.0%}' for c in CASES)} of all, ordered by error")
@@ -180,32 +169,14 @@ def fig8(out: Path, n: int = 100_000, seed: int = 1) -> None:
     axes = figure.add_subplot(facecolor=PAPER)
     place = np.arange(len(mean))
     fingers = np.repeat(FINGERS[:3], 4)
-    axes.bar(
-        place,
-        mean,
-        0.65,
-        yerr=[np.minimum(mean, spread), spread],
-        color=fingers,
-        ecolor=INK,
-        capsize=3,
-    )
-    axes.axhline(
-        PUBLISHED_ALLEGRO,
-        color="#d62728",
-        linestyle="--",
-        linewidth=1.3,
-        label="the paper: around 0.2 rad",
-    )
-    axes.axhline(
-        float(mean.mean()), color=INK, linewidth=1.3, label=f"our mean {mean.mean():.3f} rad"
-    )
-    axes.axhline(
-        floor,
-        color=INK,
-        linestyle=":",
-        linewidth=1.3,
-        label=f"median of nearest codes {floor:.3f} rad",
-    )
+    reach = [np.minimum(mean, spread), spread]
+    axes.bar(place, mean, 0.65, yerr=reach, color=fingers, ecolor=INK, capsize=3)
+    for value, color, dashes, label in (
+        (PUBLISHED_ALLEGRO, "#d62728", "--", "the paper: around 0.2 rad"),
+        (float(mean.mean()), INK, "-", f"our mean {mean.mean():.3f} rad"),
+        (floor, INK, ":", f"median of nearest codes {floor:.3f} rad"),
+    ):
+        axes.axhline(value, color=color, linestyle=dashes, linewidth=1.3, label=label)
     axes.set_xticks(place, [name.removeprefix("joint_") for name in errors.hand.joint_names])
     axes.set_xlabel(f"joint ({', '.join(errors.hand.tips.names)})", color=INK)
     axes.set_ylabel("mean absolute error [rad]", color=INK)
@@ -216,14 +187,10 @@ def fig8(out: Path, n: int = 100_000, seed: int = 1) -> None:
     write_file(out / "fig8.png", lambda file: figure.savefig(file, format="png"))
     for name, error, deviation in zip(errors.hand.joint_names, mean, spread, strict=True):
         print(f"{name:10}{error:8.3f} +- {deviation:.3f}")
-    print(
-        f"mean {mean.mean():.3f} rad; the median of nearest codes {floor:.3f}; the paper: about {PUBLISHED_ALLEGRO}"
-    )
-    _write(
-        out,
-        "fig8",
-        {"n": n, "seed": seed, "mean": mean.tolist(), "spread": spread.tolist(), "floor": floor},
-    )
+    nearest = f"the median of nearest codes {floor:.3f}"
+    print(f"mean {mean.mean():.3f} rad; {nearest}; the paper: about {PUBLISHED_ALLEGRO}")
+    numbers = {"mean": mean.tolist(), "spread": spread.tolist(), "floor": floor}
+    _write(out, "fig8", {"n": n, "seed": seed} | numbers)
     print(out / "fig8.png")
 
 

@@ -34,6 +34,12 @@ PUBLISHED = {
 }
 """Per cent of the paper's cylinder, spray and jug, of 30 trials each."""
 
+HEADS = (
+    *("row", "hand", "held of the lifts", "objects with a grasp", "pushed", "slip"),
+    *("most certain first", "paper"),
+)
+"""Heads of the columns of both tables."""
+
 FORCE: HoldingMode = "force"
 """The holding under which all closings are compared."""
 OWN: dict[ClosingMode, HoldingMode] = {
@@ -73,9 +79,7 @@ def table6(spec: Asked) -> None:
     numbers = report(rows)
     fall = contrast_over([count_held(row) for row in rows], line_weights(THRESHOLDS))
     found = "excludes zero" if fall.low > 0 or fall.high < 0 else "does not exclude zero"
-    print(
-        f"fall of the line from the first to the last: {format_points(fall)}; the interval {found}"
-    )
+    print(f"fall of the line from first to last: {format_points(fall)}; the interval {found}")
     write(spec.out / "table6.json", spec, rows, {"rows": numbers, "fall": fall})
 
 
@@ -94,9 +98,8 @@ def table7(spec: Asked) -> None:
     alike = [f"{closing}, {FORCE}" for closing in OWN]
     own = [f"{closing}, {holding}" for closing, holding in OWN.items()]
     pairs = [(names[0], name) for names in (alike, own) for name in names[1:]]
-    pairs += [
-        (names[2], name) for names in (alike, own) for name in names[3:]
-    ]  # the paper's law over the baselines
+    # the paper's law over the baselines
+    pairs += [(names[2], name) for names in (alike, own) for name in names[3:]]
     gains = {f"{a} over {b}": contrast_over([held[a], held[b]], [1.0, -1.0]) for a, b in pairs}
     for name, gain in gains.items():
         print(f"{name}: {format_points(gain)}")
@@ -108,16 +111,12 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
     rows: list[list[Cell]] = []
     for found in cells:
         if not rows:
-            shift = 1e3 * PAPER.noise.translation
-            turn = math.degrees(PAPER.noise.rotation)
-            print(
-                f"the object stands within {shift:.0f} mm and {turn:.0f} deg of where it was seen; held of lifts:"
-            )
+            within = f"{1e3 * PAPER.noise.translation:.0f} mm"
+            within += f" and {math.degrees(PAPER.noise.rotation):.0f} deg"
+            print(f"the object stands within {within} of where it was seen; held of lifts:")
             print("; ".join(cell.row for cell in found))
             rows = [[] for _ in found]
-        counts = " ".join(
-            f"{cell.held}/{len(cell.lifts)}" if cell.lifts else "none" for cell in found
-        )
+        counts = " ".join(f"{x.held}/{len(x.lifts)}" if x.lifts else "none" for x in found)
         note = next((cell.note for cell in found if cell.note), "")
         print(f"{found[0].object:28}{found[0].hand:9}{counts} {note}".rstrip(), flush=True)
         for row, cell in zip(rows, found, strict=True):
@@ -130,39 +129,23 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
 def report(rows: Sequence[Sequence[Cell]]) -> dict[str, Any]:
     """Print what is to be said of each row, of all hands and of each, and return it."""
     numbers = {row[0].row: _numbers(row) for row in rows}
-    lines = [
-        (
-            "row",
-            "hand",
-            "held of the lifts",
-            "objects with a grasp",
-            "pushed",
-            "slip",
-            "most certain first",
-            "paper",
-        )
-    ]
+    lines: list[tuple[str, ...]] = [HEADS]
     for row in rows:
         name = row[0].row
         hands = dict.fromkeys(cell.hand for cell in row)
-        parts = {"all": numbers[name]} | {
-            hand: _numbers([c for c in row if c.hand == hand]) for hand in hands
-        }
-        for hand, found in (
-            parts.items() if len(hands) > 1 else [(next(iter(hands)), numbers[name])]
-        ):
+        parts = {hand: _numbers([c for c in row if c.hand == hand]) for hand in hands}
+        if len(hands) > 1:
+            parts = {"all": numbers[name]} | parts
+        for hand, found in parts.items():
             held, certain = (format_share(found[key]) for key in ("held", "certain_first"))
-            moved = [
-                "-" if math.isnan(x) else f"{x:.1f} mm"
-                for x in (found["pushed_mm"], found["slip_mm"])
-            ]
+            moved = (found["pushed_mm"], found["slip_mm"])
+            told = ["-" if math.isnan(x) else f"{x:.1f} mm" for x in moved]
             graspable = f"{found['graspable']} of {found['objects']}"
-            lines.append((name, hand, held, graspable, *moved, certain, PUBLISHED.get(name, "-")))
+            lines.append((name, hand, held, graspable, *told, certain, PUBLISHED.get(name, "-")))
     print(f"\n{format_columns(lines, left={0, 1, 2, 6})}")
     for name, found in numbers.items():
-        print(
-            f"{name}: {', '.join(f'{n} {reason.lower()}' for reason, n in found['lost'].items()) or 'none lost'}"
-        )
+        lost = ", ".join(f"{n} {reason.lower()}" for reason, n in found["lost"].items())
+        print(f"{name}: {lost or 'none lost'}")
     return numbers
 
 
@@ -173,11 +156,10 @@ def _numbers(row: Sequence[Cell]) -> dict[str, Any]:
     lifts = [(cell.family, lift) for cell in row for lift in cell.lifts]
     objects = {cell.object: False for cell in row}
     objects |= {cell.object: True for cell in row if cell.lifts}
+    first = [(family, x.certain) for family, x in lifts if x.certain is not None]
     return {
         "held": share_over(count_held(row)),
-        "certain_first": share_over(
-            count_by((family, x.certain) for family, x in lifts if x.certain is not None)
-        ),
+        "certain_first": share_over(count_by(first)),
         "pushed_mm": median(1e3 * x.pushed for _, x in lifts),
         "slip_mm": median(1e3 * x.slip for _, x in lifts if x.held),
         "objects": len(objects),

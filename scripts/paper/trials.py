@@ -54,12 +54,10 @@ def run_cells(spec: TableSpec, rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]
     """
     for hand in spec.hands:
         load_hand(hand)
-    tasks = [
-        (spec, tuple(rows), subject, hand) for hand in spec.hands for subject in subjects(spec)
-    ]
-    for (*_, subject, hand), cells in zip(
-        tasks, run_tasks(fill, tasks, spec.workers, CELL_SECONDS), strict=True
-    ):
+    pairs = [(subject, hand) for hand in spec.hands for subject in subjects(spec)]
+    tasks = [(spec, tuple(rows), *pair) for pair in pairs]
+    filled = run_tasks(fill, tasks, spec.workers, CELL_SECONDS)
+    for (subject, hand), cells in zip(pairs, filled, strict=True):
         if isinstance(cells, Status):
             about = subject.label, subject.family, subject.group, hand
             cells = tuple(Cell(*about, row.name, (), 1, cells.sentence) for row in rows)
@@ -78,10 +76,9 @@ def subjects(spec: TableSpec) -> list[Subject]:
         found += [
             Subject(folder, name, entry.family, entry.group) for name, entry in entries.items()
         ]
+    kept = [subject for subject in found if not spec.only or subject.name in spec.only]
     families: dict[str, list[Subject]] = {}
-    for subject in sorted(
-        (s for s in found if not spec.only or s.name in spec.only), key=lambda s: s.label
-    ):
+    for subject in sorted(kept, key=lambda x: x.label):
         families.setdefault(subject.family, []).append(subject)
     ranked = [(k, subject) for some in families.values() for k, subject in enumerate(some)]
     ranked.sort(key=lambda x: (x[0], seed_of(spec.seed, x[1].label)))
@@ -98,7 +95,7 @@ def fill(
     bench = _Bench(spec, subject, hand_name)
     cells = []
     for row in rows:
-        asked = dataclasses.replace(row, name=""), spec.views, spec.grasps, spec.draws
+        asked = (dataclasses.replace(row, name=""), spec.views, spec.grasps, spec.draws)
         path = spec.kept("cells", f"{hand_name}_{subject.label}", *asked).with_suffix(".json")
         if not path.is_file():
             write_file(path, format_json(dataclasses.asdict(bench.fill(row))))
@@ -109,14 +106,11 @@ def fill(
 def _read_cell(path: Path) -> Cell:
     """Read a kept cell, with NaN for null."""
     kept = json.loads(path.read_text("utf-8"))
-    lifts = [
-        Lift(
-            **lift
-            | {"status": Status[lift["status"]]}
-            | {name: math.nan for name in ("pushed", "slip") if lift[name] is None}
-        )
-        for lift in kept.pop("lifts")
-    ]
+    lifts = list[Lift]()
+    for lift in kept.pop("lifts"):
+        lift["status"] = Status[lift["status"]]
+        lift |= {name: math.nan for name in ("pushed", "slip") if lift[name] is None}
+        lifts.append(Lift(**lift))
     return Cell(**kept, lifts=tuple(lifts))
 
 
@@ -186,14 +180,10 @@ class _Bench:
 
     def _plan(self, view: str, row: Row) -> Grasps:
         """Plan on a view of an object that stands on a table at z = 0."""
-        grasps = plan_grasps(
-            self.solid.views[view],
-            self.hand,
-            ContactSpec(max_variance=row.variance, table=0.0),
-            self.spec.starts,
-            self.spec.seed,
-            shape=self.shape(view, row.support),
-        )
+        cloud = self.solid.views[view]
+        asked = ContactSpec(max_variance=row.variance, table=0.0)
+        given = (self.hand, asked, self.spec.starts, self.spec.seed)
+        grasps = plan_grasps(cloud, *given, shape=self.shape(view, row.support))
         return grasps[grasps.status == Status.OK]
 
     def shape(self, view: str, support: Support) -> ShapeGP:
@@ -209,9 +199,8 @@ class _Bench:
         mesh, parts, mass, _ = self.solid
         mass = mass if self.subject.folder is None else MASS
         seed = seed_of(self.spec.seed, self.subject.label, view, rank, draw)
-        trial = dataclasses.replace(
-            PAPER.trial, closing=row.closing, holding=row.holding, mass=mass
-        )
+        law = {"closing": row.closing, "holding": row.holding}
+        trial = dataclasses.replace(PAPER.trial, mass=mass, **law)
         error = draw_error(PAPER, grasp, mesh, seed)
         touch = seed_of(seed, "touch")
         found = close_hand(grasp, self.hand, mesh, trial, touch, parts=parts, error=error)

@@ -45,6 +45,7 @@ def write_object(name: str) -> None:
     if not (mesh.is_volume and mesh.body_count == 1 and len(mesh.faces) <= 20_000):
         raise SystemExit(f"{name}: not one closed body of at most 20000 faces")
     content = mesh.export(file_type="ply", vertex_normal=False)
+    assert isinstance(content, bytes)
     write_file(DATA / name / "mesh.ply", content)
     columns = {
         "corners": np.concatenate(parts).astype(np.float32),
@@ -53,9 +54,8 @@ def write_object(name: str) -> None:
     write_file(DATA / name / "parts.npz", lambda file: np.savez_compressed(file, **columns))
     azimuth, elevation = VIEWS[name]
     cloud = partial_view(mesh, look_at(azimuth, elevation, target=mesh))
-    save_cloud(
-        dataclasses.replace(cloud, frustum=None), DATA / name / "view.ply"
-    )  # the whole object is in view
+    # the whole object is in view
+    save_cloud(dataclasses.replace(cloud, frustum=None), DATA / name / "view.ply")
     print(f"{name}: {len(mesh.faces)} faces, {mesh.volume * 1e6:.0f} cm3, {len(parts)} parts")
 
 
@@ -65,19 +65,15 @@ def golden(seed: int = 0) -> None:
     Args:
         seed: of the plans.
     """
+    spec = ContactSpec(table=0.0)
     for name, hand_name in sorted({(case.object, case.hand) for case in GOLDEN}):
-        hand = load_hand(hand_name)
-        grasps = plan_grasps(
-            load_object(name).view, hand, ContactSpec(table=0.0), starts=300, seed=seed
-        )
+        view = load_object(name).view
+        grasps = plan_grasps(view, load_hand(hand_name), spec, starts=300, seed=seed)
         grasps[grasps.status == Status.OK][0].save(DATA / name / f"{hand_name}.safetensors")
     simulators: tuple[Simulator, ...] = ("sapien", "mujoco")
     for simulator in simulators:
         for result in run_golden(simulator):
             print(simulator, result)
             if not result.right:
-                raise BadArgument(
-                    "seed",
-                    f"{seed}: {result.case} is wrong in {simulator}",
-                    "one with right verdicts",
-                )
+                wrong = f"{seed}: {result.case} is wrong in {simulator}"
+                raise BadArgument("seed", wrong, "one with right verdicts")

@@ -28,6 +28,12 @@ FACTORS = np.arange(0.2, 1.5, 0.01)
 SAMPLES = 1500
 """Points on the true surface of a view."""
 
+HEADS = (
+    *("kind, group", "table", "views", "factor"),
+    *("1 std_m %", "2 std_m %", "3 std_m %", "80 % in 2"),
+)
+"""Heads of the table."""
+
 Row = dict[str, Any]
 """Family, group, the kind of hidden side with whether there was a table, errors over the
 posterior's deviations.
@@ -69,61 +75,34 @@ def fit_factor(ratios: list[np.ndarray]) -> float:
 
     `ratios` are errors over the posterior's own deviations, view by view.
     """
-    misses = [
-        sum(
-            abs(h - s) / t
-            for h, s, t in zip(_held(ratios, f), NORMAL_SHARES, TOLERANCES, strict=True)
-        )
-        for f in FACTORS
-    ]
+    misses = list[float]()
+    for factor in FACTORS:
+        # within 1, 2 and 3 deviations
+        held = [np.mean([(ratio <= k * factor).mean() for ratio in ratios]) for k in (1, 2, 3)]
+        off = np.abs(np.subtract(held, NORMAL_SHARES)) / TOLERANCES
+        misses.append(float(off.sum()))
     return round(float(FACTORS[int(np.argmin(misses))]), 2)
-
-
-def _held(ratios: list[np.ndarray], factor: float) -> list[float]:
-    """Return the shares within 1, 2 and 3 calibrated deviations, means over views."""
-    return [float(np.mean([(ratio <= k * factor).mean() for ratio in ratios])) for k in (1, 2, 3)]
 
 
 def format_shares(rows: Sequence[Row]) -> str:
     """Return what bands hold with each row's factor, by kind and group, with intervals over
     families, as a table.
     """
-    table: list[tuple[str, ...]] = [
-        (
-            "kind, group",
-            "table",
-            "views",
-            "factor",
-            "1 std_m %",
-            "2 std_m %",
-            "3 std_m %",
-            "80 % in 2",
-        )
-    ]
+    table: list[tuple[str, ...]] = [HEADS]
     labels = [
         [row["kind"], (row["group"], row["kind"][1]), ("all", row["kind"][1])] for row in rows
     ]
     for name in (name for column in zip(*labels, strict=True) for name in sorted(set(column))):
         mine = [row for row, own in zip(rows, labels, strict=True) if name in own]
-        cells = []
+        cells = [name[0], "yes" if name[1] else "no", str(len(mine))]
+        cells.append(f"{np.mean([row['factor'] for row in mine]):.2f}")
         for k in (1, 2, 3):
-            found = mean_over(
-                (row["family"], 100 * float((row["ratio"] <= k * row["factor"]).mean()))
-                for row in mine
-            )
+            shares = [float((row["ratio"] <= k * row["factor"]).mean()) for row in mine]
+            families = [row["family"] for row in mine]
+            found = mean_over(zip(families, (100 * share for share in shares), strict=True))
             cells.append(f"{found.value:.1f} [{found.low:.1f}, {found.high:.1f}]")
         most = np.mean([(row["ratio"] <= 2 * row["factor"]).mean() >= 0.8 for row in mine])
-        factor = f"{np.mean([row['factor'] for row in mine]):.2f}"
-        table.append(
-            (
-                name[0],
-                "yes" if name[1] else "no",
-                str(len(mine)),
-                factor,
-                *cells,
-                f"{most:.0%} of views",
-            )
-        )
+        table.append((*cells, f"{most:.0%} of views"))
     return format_columns(table, left=(0, 1))
 
 

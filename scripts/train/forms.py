@@ -105,7 +105,7 @@ def stone(draw: Draw) -> Thing:
 def blocks(draw: Draw) -> Thing:
     """Two to four boxes and bars that run into each other."""
     first = [draw(25, 80) for _ in range(3)]
-    thing = box(*first)
+    thing = box(first[0], first[1], first[2])
     for _ in range(int(draw(1, 4))):
         x, y, z = (draw(0.25, 1.1) * edge for edge in first)
         side = (draw(-0.5, 0.5) * first[0], draw(-0.5, 0.5) * first[1], draw(0.1, 0.9) * first[2])

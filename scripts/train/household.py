@@ -40,18 +40,8 @@ trials.
 SEED = 46
 """Of all draws, beside the number of the body."""
 TOPPLED = {
-    "can",
-    "bottle",
-    "flask",
-    "jar",
-    "turned",
-    "cup",
-    "mug",
-    "goblet",
-    "vase",
-    "pitcher",
-    "gable",
-    "spray",
+    *("can", "bottle", "flask", "jar", "turned", "cup", "mug", "goblet", "vase", "pitcher"),
+    *("gable", "spray"),
 }
 """Families that stand, but of which some bodies lie on their side."""
 LYING = 0.2
@@ -116,16 +106,17 @@ def household(
         first: number of the first body.
         highest: height [m] above which a body is left out.
     """
-    bodies = filter(
-        lambda body: body.mesh.extents[2] <= highest, map(author_household, itertools.count(first))
-    )
+    bodies = map(author_household, itertools.count(first))
+    low = (body for body in bodies if body.mesh.extents[2] <= highest)
     entries = {}
-    for k, body in enumerate(itertools.islice(bodies, count)):
+    for k, body in enumerate(itertools.islice(low, count)):
         camera = look_at(GOLDEN_ANGLE * k % 360, 20.0 + 10.0 * (k % 4), target=body.mesh)
         cloud = partial_view(body.mesh, camera, seed=k)
         place = folder / body.name
         place.mkdir(parents=True, exist_ok=True)
-        write_file(place / "mesh.ply", body.mesh.export(file_type="ply"))
+        content = body.mesh.export(file_type="ply")
+        assert isinstance(content, bytes)
+        write_file(place / "mesh.ply", content)
         save_cloud(cloud, place / "view0_noisy.ply")
         pose = {"T_object_camera": camera.tolist()}
         entries[body.name] = {"family": body.family, "views": {"view0": pose}}

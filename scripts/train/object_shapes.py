@@ -78,36 +78,27 @@ def _spray() -> tuple[m3.Manifold, list[m3.Manifold]]:
     """A spray bottle: an oval body of 70 x 54 mm, a neck, and a trigger head that sprays along x;
     232 mm high.
     """
-    profile = [
-        (0.029, 0),
-        (0.033, 0.004),
-        (0.035, 0.020),
-        (0.035, 0.090),
-        (0.0335, 0.110),
-        (0.029, 0.130),
-    ]
+    profile = [(0.029, 0), (0.033, 0.004), (0.035, 0.020)]
+    profile += [(0.035, 0.090), (0.0335, 0.110), (0.029, 0.130)]
     profile += [(0.0225, 0.146), (0.0165, 0.158), (0.0145, 0.166)]
     body = [_frusta(profile[i : i + 3], flatten=0.77) for i in range(0, len(profile) - 2, 2)]
     neck = [
         _frusta([(0.0110, 0.160), (0.0110, 0.178)]),
         _frusta([(0.0165, 0.172), (0.0165, 0.186), (0.0145, 0.190)]),  # the screw cap
     ]
-    head = [
-        _prism(
-            [(-0.026, 0.206), (-0.022, 0.189), (0.016, 0.189), (0.016, 0.214), (-0.018, 0.214)],
-            0.022,
-        ),
-        _prism(
-            [(-0.026, 0.205), (0.036, 0.205), (0.036, 0.224), (-0.004, 0.232), (-0.024, 0.226)],
-            0.022,
-        ),
-        _tube((0.030, 0, 0.215), (0.052, 0, 0.215), 0.0075),  # the nozzle
-        _prism(
-            [(0.018, 0.208), (0.030, 0.208), (0.036, 0.186), (0.029, 0.184)], 0.012
-        ),  # the trigger
-        _prism([(0.036, 0.187), (0.029, 0.186), (0.033, 0.164), (0.040, 0.163)], 0.012),
-        _prism([(0.040, 0.165), (0.033, 0.166), (0.041, 0.150), (0.047, 0.153)], 0.012),
-    ]
+    heads = (
+        [(-0.026, 0.206), (-0.022, 0.189), (0.016, 0.189), (0.016, 0.214), (-0.018, 0.214)],
+        [(-0.026, 0.205), (0.036, 0.205), (0.036, 0.224), (-0.004, 0.232), (-0.024, 0.226)],
+    )
+    triggers = (
+        [(0.018, 0.208), (0.030, 0.208), (0.036, 0.186), (0.029, 0.184)],
+        [(0.036, 0.187), (0.029, 0.186), (0.033, 0.164), (0.040, 0.163)],
+        [(0.040, 0.165), (0.033, 0.166), (0.041, 0.150), (0.047, 0.153)],
+    )
+    # the union depends on which solid was made first
+    head = [_prism(outline, 0.022) for outline in heads]
+    head.append(_tube((0.030, 0, 0.215), (0.052, 0, 0.215), 0.0075))  # the nozzle
+    head += [_prism(outline, 0.012) for outline in triggers]
     return _unite([*body, *neck, *head])
 
 
@@ -115,28 +106,18 @@ def _jug() -> tuple[m3.Manifold, list[m3.Manifold]]:
     """A full jug: 152 mm high, 78 mm wide, filled to 14 mm below the rim, a spout along x, a handle
     behind.
     """
-    outline = [
-        (0.030, 0),
-        (0.034, 0.004),
-        (0.037, 0.025),
-        (0.039, 0.050),
-        (0.0385, 0.070),
-        (0.036, 0.090),
-    ]
+    outline = [(0.030, 0), (0.034, 0.004), (0.037, 0.025)]
+    outline += [(0.039, 0.050), (0.0385, 0.070), (0.036, 0.090)]
     outline += [(0.0325, 0.108), (0.0305, 0.120), (0.0305, 0.126), (0.0315, 0.138)]
     body = [_frusta(outline[i : i + 3]) for i in (0, 2, 4)]
-    body += [
-        _frusta(outline[i : i + 2]) for i in (6, 7, 8)
-    ]  # the outline is hollow at the neck: one frustum each
-    rim, staves = _ring(
-        [(0.0315, 0.138), (0.0340, 0.152)], [(0.0275, 0.138), (0.0305, 0.152)], pieces=24
-    )
-    spout = m3.Manifold.hull_points(
-        np.array(
-            [(0.029, s * 0.013, z) for s in (-1, 1) for z in (0.135, 0.152)]
-            + [(0.030, 0, 0.122), (0.047, 0.004, 0.153), (0.047, -0.004, 0.153), (0.045, 0, 0.149)]
-        )
-    )
+    # the outline is hollow at the neck: one frustum each
+    body += [_frusta(outline[i : i + 2]) for i in (6, 7, 8)]
+    outside = [(0.0315, 0.138), (0.0340, 0.152)]
+    inside = [(0.0275, 0.138), (0.0305, 0.152)]
+    rim, staves = _ring(outside, inside, pieces=24)
+    root = [(0.029, s * 0.013, z) for s in (-1, 1) for z in (0.135, 0.152)]
+    lip = [(0.030, 0, 0.122), (0.047, 0.004, 0.153), (0.047, -0.004, 0.153), (0.045, 0, 0.149)]
+    spout = m3.Manifold.hull_points(np.array(root + lip))
     angle = np.linspace(math.radians(62), math.radians(-68), 11)
     path = [(-0.030 - 0.038 * math.cos(a), 0.0, 0.082 + 0.046 * math.sin(a)) for a in angle]
     path = [(-0.0285, 0.0, 0.1255), *path, (-0.034, 0.0, 0.033)]
@@ -173,15 +154,10 @@ def _frusta(profile: Sequence[Vector], flatten: float = 1.0) -> Solid:
 
     def revolve(segments: int, grow: float) -> m3.Manifold:
         angle = np.arange(segments) * 2 * np.pi / segments
+        x = np.cos(angle)
+        y = np.sin(angle)
         rings = [
-            np.stack(
-                [
-                    r * grow * np.cos(angle),
-                    r * grow * flatten * np.sin(angle),
-                    np.full(segments, z),
-                ],
-                -1,
-            )
+            np.stack([r * grow * x, r * grow * flatten * y, np.full(segments, z)], -1)
             for r, z in profile
         ]
         return m3.Manifold.hull_points(np.concatenate(rings))

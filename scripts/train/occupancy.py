@@ -5,7 +5,6 @@ the model is fitted to; the others judge it. Places are drawn where the camera c
 meshes tell which are full.
 """
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,8 @@ from benchmarks.scene.scenes import scatter
 from torchgrasp import Scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
+from torchgrasp.data import read_entry, read_object_mesh
+from torchgrasp.data.manifest import read_entries
 from torchgrasp.files import format_json, write_file
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
@@ -49,6 +50,11 @@ sizes.
 PLACES = 60_000
 KEPT = 1500
 """Places drawn around a target, and hidden ones of each kind that are kept."""
+SEEN = 400
+"""Least number of pixels of a target."""
+DAMPING = 3.0
+STEPS = 30
+"""Weight of the squares of the values in the regression; steps of Newton's method."""
 BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 """Bins of the reliability."""
 
@@ -73,18 +79,15 @@ def make_scene(
             radius += 0.02
     for mesh, pose in zip(things, poses, strict=True):
         mesh.apply_transform(pose.numpy())
-    camera = look_at(
-        float(rng.uniform(0, 360)), float(rng.uniform(30, 60)), float(rng.uniform(0.45, 0.8))
-    )
+    camera = look_at(rng.uniform(0, 360), rng.uniform(30, 60), rng.uniform(0.45, 0.8))
     depth, labels = render_depth(things, camera, seed=seed)
     pixels = torch.nonzero(depth > 0)
     seen = labels[pixels[:, 0], pixels[:, 1]]
     points = cloud_from_depth(depth, INTRINSICS, camera_pose=camera).points
     order = np.argsort([np.linalg.norm(mesh.bounds.mean(0)[:2]) for mesh in things])
-    target = next(int(i) + 1 for i in order if int((seen == i + 1).sum()) > 400)
-    scene = Scene(
-        points, seen, DepthImage(depth, INTRINSICS, camera), pixels, Plane.horizontal(0.0), target
-    )
+    target = next(int(i) + 1 for i in order if int((seen == i + 1).sum()) > SEEN)
+    image = DepthImage(depth, INTRINSICS, camera)
+    scene = Scene(points, seen, image, pixels, Plane.horizontal(0.0), target)
     cloud = scene.cloud()
     frame = upright_frame(cloud.points, cloud.viewpoint, scene.table)
     for mesh in things:
@@ -99,6 +102,8 @@ def collect(
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {kind: [] for kind in KNOTS}
     for seed in seeds:
         scene, things = make_scene(meshes, seed)
+        assert scene.target is not None
+        others = [mesh for k, mesh in enumerate(things, start=1) if k != scene.target]
         shadows = cast_shadows(scene, scene.target)
         rng = np.random.default_rng(seed)
         own = scene.points[scene.rows_of()]
@@ -122,13 +127,10 @@ def collect(
                     features = torch.stack([behind[some], places[some, 2]], -1)
                 else:
                     features = shadow_features(shadows, thing, places[some])
-                full = np.zeros(len(some), bool)
-                for k, mesh in enumerate(things):
-                    if k + 1 != scene.target:
-                        full |= mesh.contains(places[some].numpy())
-                found[kind].append((features.numpy(), full))
+                inside = [mesh.contains(places[some].numpy()) for mesh in others]
+                found[kind].append((features.numpy(), np.any(inside, 0)))
     return {
-        kind: tuple(np.concatenate(x) for x in zip(*parts, strict=True))
+        kind: (np.concatenate([x for x, _ in parts]), np.concatenate([x for _, x in parts]))
         for kind, parts in found.items()
     }
 
@@ -145,19 +147,15 @@ def fit(
     ]
     design = np.concatenate([*hats, np.ones((len(full), 1))], 1)
     weights = np.zeros(design.shape[1])
-    damping = np.r_[np.full(design.shape[1] - 1, 3.0), 0.0]
-    for _ in range(30):
+    damping = np.r_[np.full(design.shape[1] - 1, DAMPING), 0.0]
+    for _ in range(STEPS):
         p = 1 / (1 + np.exp(-design @ weights))
         gradient = design.T @ (p - full) + damping * weights
-        weights -= np.linalg.solve(
-            (design * (p * (1 - p))[:, None]).T @ design + np.diag(damping + 1e-6), gradient
-        )
-    values = np.split(np.round(weights[:-1], 3), np.cumsum([len(k) for k in knots])[:-1])
-    return {
-        "bias": round(float(weights[-1]), 3),
-        "knots": knots,
-        "values": [v.tolist() for v in values],
-    }
+        curvature = (design * (p * (1 - p))[:, None]).T @ design + np.diag(damping + 1e-6)
+        weights -= np.linalg.solve(curvature, gradient)
+    split = np.split(np.round(weights[:-1], 3), np.cumsum([len(k) for k in knots])[:-1])
+    values = [v.tolist() for v in split]
+    return {"bias": round(float(weights[-1]), 3), "knots": knots, "values": values}
 
 
 def reliability(p: np.ndarray, full: np.ndarray) -> list[str]:
@@ -180,26 +178,19 @@ def occupancy(objects: tyro.conf.Positional[Path], scenes: int = 30, model: Path
         model: file of the model.
     """
     torch.set_num_threads(1)
-    manifest = json.loads((objects / "manifest.json").read_text("utf-8"))["objects"]
-    families = sorted({entry["family"] for entry in manifest.values()})
-    halves = [
-        {
-            n: trimesh.load(objects / n / "mesh.ply")
-            for n, e in manifest.items()
-            if families.index(e["family"]) % 2 == k
-        }
-        for k in (0, 1)
-    ]
-    seen, unseen = (
-        collect(half, range(k * 1000, k * 1000 + scenes)) for k, half in enumerate(halves)
-    )
+    family = {name: read_entry(objects, name).family for name in read_entries(objects)}
+    families = sorted(set(family.values()))
+    halves: tuple[dict[str, trimesh.Trimesh], ...] = ({}, {})
+    for name in family:
+        halves[families.index(family[name]) % 2][name] = read_object_mesh(objects, name)
+    seen = collect(halves[0], range(scenes))
+    unseen = collect(halves[1], range(1000, 1000 + scenes))
     content = {kind: fit(*seen[kind], KNOTS[kind]) for kind in KNOTS}
     note = f"{scenes} rendered scenes of 5 to 8 objects of {len(families) // 2} families"
     write_file(model, format_json({**content, "fitted_on": note}) + "\n")
     load_occupancy_model.cache_clear()
     for kind, (features, full) in unseen.items():
         p = probability(kind, torch.from_numpy(features)).numpy()
-        print(
-            f"{kind}: {full.mean():.3f} full, Brier {np.mean((p - full) ** 2):.4f} of {full.var():.4f}"
-        )
+        brier = np.mean((p - full) ** 2)
+        print(f"{kind}: {full.mean():.3f} full, Brier {brier:.4f} of {full.var():.4f}")
         print(*reliability(p, full), sep="\n", flush=True)

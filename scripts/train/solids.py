@@ -75,9 +75,8 @@ def stack(profile: Profile, oval: float = 1.0, sides: int = SIDES) -> Thing:
     scales it along y.
     """
     rings = [disc(r, r * oval, z, sides) for r, z in profile]
-    pieces = [
-        np.concatenate(pair) for pair in itertools.pairwise(rings) if pair[0][0, 2] < pair[1][0, 2]
-    ]
+    pairs = itertools.pairwise(rings)
+    pieces = [np.concatenate((low, high)) for low, high in pairs if low[0, 2] < high[0, 2]]
     return [Solid(_sew(np.stack(rings)), pieces)]
 
 
@@ -85,9 +84,8 @@ def disc(a: float, b: float, z: float, sides: int = SIDES) -> np.ndarray:
     """Return the corners (sides, 3) of an ellipse at height z, with half axes a along x and b along
     y.
     """
-    angle = (
-        2 * math.pi * (np.arange(sides) + 0.5) / sides
-    )  # a side, not a corner, is lowest in a lying solid
+    # a side, not a corner, is lowest in a lying solid
+    angle = 2 * math.pi * (np.arange(sides) + 0.5) / sides
     return np.stack([a * np.cos(angle), b * np.sin(angle), np.full(sides, z)], -1)
 
 
@@ -100,15 +98,11 @@ def shell(levels: Sequence[tuple[float, float, float]], oval: float = 1.0) -> Th
     pieces = []
     for level, k in itertools.product(range(len(levels) - 1), range(0, 2 * SECTORS, 2)):
         seen = np.arange(k, k + 3) % (2 * SECTORS)
-        pieces.append(
-            np.concatenate([*outer[level : level + 2, seen], *inner[level : level + 2, seen[::2]]])
-        )
+        both = slice(level, level + 2)
+        pieces.append(np.concatenate([*outer[both, seen], *inner[both, seen[::2]]]))
+    # the hole opens both ends
     hole = inner[:, ::2]
-    beyond = [
-        hole[:1] - np.array([0, 0, 1]),
-        hole,
-        hole[-1:] + np.array([0, 0, 1]),
-    ]  # the hole opens both ends
+    beyond = [hole[:1] - np.array([0, 0, 1]), hole, hole[-1:] + np.array([0, 0, 1])]
     return [Solid(_sew(outer) - _sew(np.concatenate(beyond)), pieces)]
 
 
@@ -123,16 +117,11 @@ def vessel(outline: Profile, wall: float, floor: float, oval: float = 1.0) -> Th
     inner = outer - wall * np.hypot(1.0, np.gradient(outer, levels))
     inner = np.maximum(inner, 0.1 * outer)  # a thick wall leaves a narrow hole
     (around,) = shell(list(zip(outer, inner, levels, strict=True)), oval)
-    base = np.stack(
-        [disc(r, r * oval, z, 2 * SECTORS) for r, z in ((radius[0], 0.0), (outer[0], floor))]
-    )
+    ends = ((radius[0], 0.0), (outer[0], floor))
+    base = np.stack([disc(r, r * oval, z, 2 * SECTORS) for r, z in ends])
     halves = [np.arange(first, first + SECTORS + 1) % (2 * SECTORS) for first in (0, SECTORS)]
-    return [
-        Solid(
-            _sew(base) + around.body,
-            [base[:, half].reshape(-1, 3) for half in halves] + around.pieces,
-        )
-    ]
+    pieces = [base[:, half].reshape(-1, 3) for half in halves]
+    return [Solid(_sew(base) + around.body, pieces + around.pieces)]
 
 
 def box(x: float, y: float, z: float, at: Sequence[float] = (0.0, 0.0, 0.0)) -> Thing:
@@ -157,11 +146,9 @@ def prism(
 ) -> Thing:
     """Return a convex outline of (x, y), extruded along z to a top that is scaled by this factor."""
     flat = np.array(outline)
-    return lump(
-        np.concatenate(
-            [np.c_[flat, np.zeros(len(flat))], np.c_[top * flat, np.full(len(flat), height)]]
-        )
-    )
+    below = np.c_[flat, np.zeros(len(flat))]
+    above = np.c_[top * flat, np.full(len(flat), height)]
+    return lump(np.concatenate([below, above]))
 
 
 def slab(x: float, y: float, z: float, corner: float, edge: float) -> Thing:
@@ -172,9 +159,8 @@ def slab(x: float, y: float, z: float, corner: float, edge: float) -> Thing:
     rounded = np.radians(quarter + np.tile([0, 45, 90], 4))
     middle = np.radians(quarter + 45)
     sign = np.sign(np.stack([np.cos(middle), np.sin(middle)], -1))
-    flat = sign * (x / 2 - corner, y / 2 - corner) + corner * np.stack(
-        [np.cos(rounded), np.sin(rounded)], -1
-    )
+    arcs = corner * np.stack([np.cos(rounded), np.sin(rounded)], -1)
+    flat = sign * (x / 2 - corner, y / 2 - corner) + arcs
     inset = flat * (1 - 2 * edge / x, 1 - 2 * edge / y)
     levels = ((inset, 0.0), (flat, edge), (flat, z - edge), (inset, z))
     return lump(np.concatenate([np.c_[ring, np.full(12, height)] for ring, height in levels]))
@@ -197,12 +183,8 @@ def ball(a: float, b: float, c: float, slices: int = 8) -> Thing:
 def pebble(a: float, b: float, c: float, at: Sequence[float] = (0.0, 0.0, 0.0)) -> Thing:
     """Return a coarse ellipsoid about `at` in one piece, for a detail."""
     angle = np.linspace(0.35, math.pi - 0.35, 4)
-    return lump(
-        np.concatenate(
-            [disc(a * math.sin(t), b * math.sin(t), c * math.cos(t), ROUND) for t in angle]
-        )
-        + at
-    )
+    rings = [disc(a * math.sin(t), b * math.sin(t), c * math.cos(t), ROUND) for t in angle]
+    return lump(np.concatenate(rings) + at)
 
 
 def rod(
@@ -238,13 +220,10 @@ def path(
     up = np.asarray(normal, float) / np.linalg.norm(normal)
     out = np.cross(along / np.linalg.norm(along, axis=1, keepdims=True), up)
     section = disc(1.0, 1.0, 0.0, sides) * (math.sqrt(2) if sides == 4 else 1.0)
-    half = [
-        np.broadcast_to(x, len(points))[:, None, None]
-        for x in (thick, thick if wide is None else wide)
-    ]
-    rings = (
-        points[:, None] + half[0] * section[:, :1] * out[:, None] - half[1] * section[:, 1:2] * up
-    )
+    sizes = (thick, thick if wide is None else wide)
+    deep, broad = (np.broadcast_to(x, len(points))[:, None, None] for x in sizes)
+    inward = deep * section[:, :1] * out[:, None]
+    rings = points[:, None] + inward - broad * section[:, 1:2] * up
     pairs = itertools.pairwise([*rings, rings[0]] if closed else rings)
     return [Solid(_sew(rings, closed), [np.concatenate(pair) for pair in pairs])]
 
@@ -263,9 +242,7 @@ def arc(
 def move(thing: Thing, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Thing:
     """Return the thing, moved."""
     by = np.array([x, y, z])
-    return [
-        Solid(body.translate((x, y, z)), [piece + by for piece in pieces]) for body, pieces in thing
-    ]
+    return [Solid(body.translate((x, y, z)), [p + by for p in pieces]) for body, pieces in thing]
 
 
 def turn(thing: Thing, axis: str, degrees: float) -> Thing:
@@ -275,10 +252,7 @@ def turn(thing: Thing, axis: str, degrees: float) -> Thing:
     matrix = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     matrix = np.round(matrix) if degrees % 90 == 0 else matrix
     pose = np.c_[matrix, np.zeros(3)]
-    return [
-        Solid(body.transform(pose), [piece @ matrix.T for piece in pieces])
-        for body, pieces in thing
-    ]
+    return [Solid(body.transform(pose), [p @ matrix.T for p in pieces]) for body, pieces in thing]
 
 
 def lie(thing: Thing) -> Thing:
@@ -308,12 +282,9 @@ def unite(thing: Thing) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:
     >>> round(mesh.volume * 1e9), mesh.is_volume, len(parts)
     (25000, True, 2)
     """
-    union = m3.Manifold.batch_boolean([solid.body for solid in thing], m3.OpType.Add).simplify(
-        MERGED
-    )
-    return _in_metres(union), [
-        _in_metres(m3.Manifold.hull_points(piece)) for s in thing for piece in s.pieces
-    ]
+    union = m3.Manifold.batch_boolean([solid.body for solid in thing], m3.OpType.Add)
+    hulls = [m3.Manifold.hull_points(piece) for solid in thing for piece in solid.pieces]
+    return _in_metres(union.simplify(MERGED)), list(map(_in_metres, hulls))
 
 
 def find_rest(mesh: trimesh.Trimesh) -> np.ndarray:
@@ -328,13 +299,11 @@ def find_rest(mesh: trimesh.Trimesh) -> np.ndarray:
     height = -planes[:, 3] - normals @ mesh.center_mass  # of the mass centre above each face
     cosine = normals @ normals.T
     sine = np.sqrt(np.maximum(1 - cosine**2, 0))
-    reach = (height - height[:, None] * cosine) / np.maximum(
-        sine, 1e-9
-    )  # from below the mass centre to each edge
+    # from below the mass centre to each edge
+    reach = (height - height[:, None] * cosine) / np.maximum(sine, 1e-9)
     within = np.where(sine > 1e-6, reach, np.inf).min(1) >= 0  # a face has no edge with itself
-    steady = (
-        np.where(sine > math.sin(math.radians(ROCKING)), reach, np.inf).min(1) / height * within
-    )
+    apart = sine > math.sin(math.radians(ROCKING))
+    steady = np.where(apart, reach, np.inf).min(1) / height * within
     good = steady >= min(math.tan(math.radians(STEADY)), steady.max())
     down = normals[np.argmax(np.where(good, -normals[:, 2], -np.inf))]
     pose = np.eye(4)
@@ -364,9 +333,8 @@ def _sew(rings: np.ndarray, closed: bool = False) -> m3.Manifold:
     row, column = np.meshgrid(np.arange(n if closed else n - 1), np.arange(k), indexing="ij")
     right = (column + 1) % k
     up = (row + 1) % n
-    a, b, c, d = (
-        x.ravel() for x in (row * k + column, row * k + right, up * k + right, up * k + column)
-    )
+    quads = (row * k + column, row * k + right, up * k + right, up * k + column)
+    a, b, c, d = (x.ravel() for x in quads)
     p, q, r, s = (corners[x] for x in (a, b, c, d))
     bulge = (np.cross(q - p, r - p) * (s - p)).sum(-1)[:, None] <= 0
     faces = [

@@ -10,6 +10,7 @@ predictions count as known.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -45,6 +46,10 @@ TREES = {
 RISES = ("force to spare", *CAUSES["moved"], "friction")
 FALLS = ("force needed", "mass", "displaced", "deviation", "tilt")
 """Features that never lower the prediction when they rise, or never raise it."""
+
+FRICTIONS = (0.12, 0.2, 0.4, 0.6, 0.8, 1.21)
+MASSES = (0.02, 0.05, 0.1, 0.25, 0.5, 1.01)
+"""Edges of groups of trials, of friction and of mass [kg]."""
 
 UNLIMITED = 1e9  # a bound that no feature reaches: files hold no infinity
 # knots of the intervals, and how often their families are drawn anew
@@ -158,9 +163,8 @@ def fit_model(trials: Trials, left: Array) -> SuccessModel:
     """Return the model, without promises; the mask `left` tells which trials calibrate it and fit
     no tree.
     """
-    trees = HistGradientBoostingClassifier(
-        **TREES, monotonic_cst=[directions().get(name, 0) for name in FEATURES]
-    )
+    ways = [directions().get(name, 0) for name in FEATURES]
+    trees = HistGradientBoostingClassifier(**TREES, monotonic_cst=ways)
     trees.fit(trials.features[~left], trials.passed[~left])
     others = trials.select(left)
     fitted = read_trees(trees)
@@ -170,16 +174,13 @@ def fit_model(trials: Trials, left: Array) -> SuccessModel:
     shift = float(platt.intercept_[0])
     bands = find_bands(slope * raw + shift, others.passed, others.family)
     held = trials.features[trials.passed]
-    return SuccessModel(
-        fitted.feature,
-        fitted.threshold,
-        fitted.children,
-        slope * fitted.value,
-        slope * fitted.start + shift,
-        torch.from_numpy(find_range(trials.features)),
-        torch.from_numpy(np.median(held, 0)),
-        torch.from_numpy(bands),
-        torch.zeros(0, 3, dtype=torch.float64),
+    return dataclasses.replace(
+        fitted,
+        value=slope * fitted.value,
+        start=slope * fitted.start + shift,
+        range=torch.from_numpy(find_range(trials.features)),
+        usual=torch.from_numpy(np.median(held, 0)),
+        bands=torch.from_numpy(bands),
     )
 
 
@@ -224,8 +225,8 @@ def read_trees(trees: HistGradientBoostingClassifier) -> SuccessModel:
         value[k, :n] = np.where(leaf, tree["value"], 0.0)
     start = torch.tensor(float(trees._baseline_prediction.item()), dtype=torch.float64)  # pyright: ignore
     none = torch.zeros(0, 3, dtype=torch.float64)
-    tensors = [torch.from_numpy(x) for x in (feature, threshold, children, value)]
-    return SuccessModel(*tensors, start, none[:, :2], none[:, 0], none, none)
+    reads, bounds, links, values = map(torch.from_numpy, (feature, threshold, children, value))
+    return SuccessModel(reads, bounds, links, values, start, none[:, :2], none[:, 0], none, none)
 
 
 def find_bands(odds: Array, passed: Array, family: Array, seed: int = 0) -> Array:
@@ -250,33 +251,28 @@ def judge(model: SuccessModel, trials: Trials) -> list[str]:
     """Return what is to be said of the model's predictions: of all trials, and of each group."""
     p = torch.sigmoid(model.log_odds(torch.from_numpy(trials.features)))
     columns = dict(zip(FEATURES, trials.features.T, strict=True))
+    friction = columns["friction"]
+    mass = columns["mass"]
     groups = {
         "all": np.ones(len(p), dtype=bool),
         "20 best": trials.rank < 20,
         "lifts": columns["lifted"] > 0,
         "pulls": columns["lifted"] == 0,
         "best of its body": trials.is_best(model),
-        **{hand: trials.hand == hand for hand in HANDS},
-        **{
-            f"friction {a:g} to {b:g}": (columns["friction"] >= a) & (columns["friction"] < b)
-            for a, b in ((0.12, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.21))
-        },
-        **{
-            f"{a:g} to {b:g} kg": (columns["mass"] >= a) & (columns["mass"] < b)
-            for a, b in ((0.02, 0.05), (0.05, 0.1), (0.1, 0.25), (0.25, 0.5), (0.5, 1.01))
-        },
     }
+    groups |= {hand: trials.hand == hand for hand in HANDS}
+    for a, b in itertools.pairwise(FRICTIONS):
+        groups[f"friction {a:g} to {b:g}"] = (friction >= a) & (friction < b)
+    for a, b in itertools.pairwise(MASSES):
+        groups[f"{a:g} to {b:g} kg"] = (mass >= a) & (mass < b)
     lines = []
     for name, rows in groups.items():
-        if rows.sum() < 2 or len(np.unique(trials.passed[rows])) < 2:
+        passed = trials.passed[rows]
+        if rows.sum() < 2 or len(np.unique(passed)) < 2:
             continue
-        said = score.judge(
-            p[torch.from_numpy(rows)],
-            torch.from_numpy(trials.passed[rows]),
-            trials.family[rows].tolist(),
-        )
-        lines.append(
-            f"{name}: predicted {said['predicted']:.2f}, passed {said['passed']:.2f} of {rows.sum()}; "
-            f"AUC {said['auc']:.3f}, ECE {said['error']:.3f}, Brier skill {said['skill']:.2f}"
-        )
+        predicted = p[torch.from_numpy(rows)]
+        said = score.judge(predicted, torch.from_numpy(passed), trials.family[rows].tolist())
+        text = f"predicted {said['predicted']:.2f}, passed {said['passed']:.2f} of {rows.sum()}"
+        error = f"AUC {said['auc']:.3f}, ECE {said['error']:.3f}, Brier skill {said['skill']:.2f}"
+        lines.append(f"{name}: {text}; {error}")
     return lines

@@ -12,6 +12,7 @@ from torchgrasp.evaluation import PROTOCOLS, PoseNoise, Protocol
 from torchgrasp.evaluation.protocols import POSE_NOISE
 from torchgrasp.foundation.base import Value
 from torchgrasp.success.task import GraspTask
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.specs import ClosingMode
 
 FRICTION = (0.12, 1.2)
@@ -76,19 +77,15 @@ class Task(Value):
         base = LIFT if self.lift else PULL
         error = ASIDE if self.lift else POSE_NOISE
         trial = base.trial
-        changes: dict[str, Any] = {
-            "closing": self.closing,
-            "friction": self.friction,
-            "mass": self.mass,
-        }
+        planned = Distribution.of(trial.friction).mean
+        changes: dict[str, Any] = {"closing": self.closing, "mass": self.mass, "force": self.force}
         if trial.table_friction is not None:
-            changes["table_friction"] = trial.table_friction / trial.friction * self.friction
-        changes["patch"] = (
-            trial.patch * trial.friction / self.friction
-        )  # friction times patch resists torsion
+            changes["table_friction"] = trial.table_friction / planned * self.friction
+        # friction times patch resists torsion
+        changes["patch"] = trial.patch * planned / self.friction
         noise = error if self.errs else PoseNoise()
         found = dataclasses.replace(base, noise=noise, tries=1, criterion="held")
-        return found.with_trial(**changes, force=self.force, simulator="mujoco")
+        return found.with_trial(**changes, friction=self.friction, simulator="mujoco")
 
 
 def draw_friction(draw: np.random.Generator) -> float:
@@ -109,9 +106,8 @@ def draw_ordinary(draw: np.random.Generator, planned: float) -> Task:
     """
     mass = round(math.exp(draw.uniform(*np.log(ORDINARY_MASS))), 4)
     force = round(float(draw.uniform(*ORDINARY_FORCE)), 3)
-    return dataclasses.replace(
-        draw_task(draw, planned), friction=planned, mass=mass, errs=False
-    ).pressing(force)
+    task = draw_task(draw, planned).pressing(force)
+    return dataclasses.replace(task, friction=planned, mass=mass, errs=False)
 
 
 def draw_task(draw: np.random.Generator, planned: float) -> Task:
@@ -121,21 +117,12 @@ def draw_task(draw: np.random.Generator, planned: float) -> Task:
     >>> draw_task(np.random.default_rng(0), 0.6) == draw_task(np.random.default_rng(0), 0.6)
     True
     """
-    lift, kept, errs, grips = draw.random(4) < (
-        0.25,
-        0.5,
-        0.5,
-        0.75,
-    )  # a lift takes three times as long as pulls
+    # a lift takes three times as long as pulls
+    lift, kept, errs, grips = draw.random(4) < (0.25, 0.5, 0.5, 0.75)
     friction = draw_friction(draw)
     force = round(float(draw.uniform(*FORCE)), 3)
     mass = round(math.exp(draw.uniform(*np.log(MASS))), 4)
     closing = "uncertainty" if lift or draw.random() < 0.5 else "open_loop"
-    return Task(
-        bool(lift),
-        closing,
-        planned if kept else friction,
-        mass,
-        None if lift and grips else force,
-        bool(errs),
-    )
+    asked = planned if kept else friction
+    pressing = None if lift and grips else force
+    return Task(bool(lift), closing, asked, mass, pressing, bool(errs))

@@ -52,26 +52,13 @@ from torchgrasp.success.task import Conditions
 from torchgrasp.values.planning import Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of
-from train.tasks import (
-    ORDINARY_FRICTION,
-    PULL,
-    Task,
-    draw_friction,
-    draw_ordinary,
-    draw_task,
-)
+from train.tasks import ORDINARY_FRICTION, PULL, Task, draw_friction, draw_ordinary, draw_task
 
 HANDS = ("allegro", "barrett", "leap", "shadow")
 """Hands of the trials; each body is tried with one of them."""
 
-SENSORS: tuple[bool | SensorName, ...] = (
-    True,
-    "realsense",
-    "realsense_cloud",
-    "kinect_v1",
-    "azure",
-    "zivid",
-)
+CAMERAS: tuple[SensorName, ...] = ("realsense", "realsense_cloud", "kinect_v1", "azure", "zivid")
+SENSORS: tuple[bool | SensorName, ...] = (True, *CAMERAS)
 """Noise of the views."""
 
 STARTS = 400
@@ -156,9 +143,8 @@ def trials(
     for hand in hands:
         data = run_trials(hand, bodies, folder, workers, first=first, best=best, shelf=shelf)
         counts = data.card["counts"]
-        print(
-            f"{hand}: {counts['tries']} trials on {counts['objects']} bodies, {counts['passed']} passed"
-        )
+        told = f"{counts['tries']} trials on {counts['objects']} bodies"
+        print(f"{hand}: {told}, {counts['passed']} passed")
 
 
 def run_trials(
@@ -174,19 +160,13 @@ def run_trials(
     """Try grasps of one hand on its share of some bodies from the `first` on, and return the data
     set. The bodies of a `shelf` take the place of household bodies.
     """
-    among = range(first, first + bodies)
-    numbers = [
-        k
-        for k in among
-        if k % len(HANDS) == HANDS.index(hand)
-        and (not best or shelf is not None or family_of(k) in CALIBRATING)
-    ]
+    numbers = [k for k in range(first, first + bodies) if k % len(HANDS) == HANDS.index(hand)]
+    if best and shelf is None:
+        numbers = [k for k in numbers if family_of(k) in CALIBRATING]
     model = load_hand(hand)
     of_hand = {"name": hand, "option": model.source.option, "sha256": model.source.sha256}
-    of_hand |= {
-        "joint_names": ", ".join(model.joint_names),
-        "finger_names": ", ".join(model.finger_names),
-    }
+    of_hand["joint_names"] = ", ".join(model.joint_names)
+    of_hand["finger_names"] = ", ".join(model.finger_names)
     trials = {"grasps": BEST + SPREAD, "ranks": "best and spread", "starts": STARTS, "seed": seed}
     if shelf is not None:
         trials |= {"objects": list(shelf.names)}
@@ -218,15 +198,9 @@ def run_trials(
     counts = data.card["counts"]
     spread = f"{BEST} of its twenty best grasps and {SPREAD} others"
     which = f"the best grasps for {TASKS} ordinary tasks" if best else spread
-    about = ABOUT.format(
-        hand=hand,
-        bodies="household bodies" if shelf is None else "given objects",
-        counts=counts,
-        versions=json.dumps(versions()),
-        starts=STARTS,
-        which=which,
-    )
-    write_file(folder / hand / README, about)
+    tried = "household bodies" if shelf is None else "given objects"
+    told = {"bodies": tried, "versions": json.dumps(versions()), "starts": STARTS, "which": which}
+    write_file(folder / hand / README, ABOUT.format(hand=hand, counts=counts, **told))
     return data
 
 
@@ -273,13 +247,11 @@ def _try_body(
     seen = {"sensor": str(sensor), "region": "half" if kept else "none"}
     row = row._replace(executable=len(executable), points=len(cloud), meta=seen)
     if not len(executable):
-        row = row._replace(
-            status=Status(int(found.status.mode().values)) if len(found) else Status.OUT_OF_REACH
-        )
-        empty = empty_shard(row, hand, 1).records
-        return Shard(
-            (row,), dataclasses.replace(empty, points=cloud.points.double(), viewpoints=eye)
-        )
+        why = Status(int(found.status.mode().values)) if len(found) else Status.OUT_OF_REACH
+        row = row._replace(status=why)
+        records = empty_shard(row, hand, 1).records
+        seen_alone = dataclasses.replace(records, points=cloud.points.double(), viewpoints=eye)
+        return Shard((row,), seen_alone)
     shape = fit_shape(cloud, table=table)
     if best:
         tasks = [draw_ordinary(draw, friction) for _ in range(TASKS)]
@@ -294,18 +266,14 @@ def _try_body(
         own = seed_of(seed, number if best else rank)
         error = draw_error(task.protocol, grasp, body.mesh, own)
         truth = Truth(body.mesh, body.parts, error)
-        trial = GraspTrial(
-            hand, grasp, truth, seed_of(own, "touch"), surface=surface if task.lift else None
-        )
+        known = surface if task.lift else None
+        trial = GraspTrial(hand, grasp, truth, seed_of(own, "touch"), surface=known)
         results.append(run_protocol(trial, task.protocol, rank))
     passed = torch.tensor([[x.passed] for x in results])
     outcome = torch.tensor([[int(x.status)] for x in results])
     said = json.dumps([dataclasses.asdict(task) for task in tasks])
-    meta = (
-        executable.meta
-        | row.meta
-        | {"tasks": said, "ranks": json.dumps(ranks), "friction": str(friction)}
-    )
+    tried = {"tasks": said, "ranks": json.dumps(ranks), "friction": str(friction)}
+    meta = executable.meta | row.meta | tried
     row = row._replace(grasps=len(ranks), passed=int(passed.sum()), meta=meta)
     return Shard((row,), Records(cloud.points.double(), eye, executable[ranks], passed, outcome))
 
@@ -339,14 +307,8 @@ def best_for(tasks: Sequence[Task], hand: Hand, shape: ShapeGP, grasps: Grasps) 
     for task in tasks:
         conditions = Conditions.of(task.friction, task.known.mass)
         features = measure_grasps(hand, body, grasps, conditions, task.known, task.lift)[0]
-        best.append(
-            int(
-                load_success_model()
-                .log_odds(features)
-                .where(is_covered(features), -torch.inf)
-                .argmax()
-            )
-        )
+        odds = load_success_model().log_odds(features)
+        best.append(int(odds.where(is_covered(features), -torch.inf).argmax()))
     return best
 
 
@@ -378,9 +340,5 @@ def read_rows(shards: Iterable[Shard]) -> Iterator[tuple[JobRow, PointCloud, Gra
                 Trial(row.object, row.family, rank, task, bool(passed), Status(int(status)))
                 for rank, task, passed, status in outcomes
             ]
-            yield (
-                row,
-                PointCloud(records.points, viewpoint=records.viewpoints[0]),
-                records.grasps,
-                trials,
-            )
+            cloud = PointCloud(records.points, viewpoint=records.viewpoints[0])
+            yield row, cloud, records.grasps, trials

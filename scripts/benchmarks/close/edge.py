@@ -72,27 +72,14 @@ def _tried(o: Options, folder: Path, hand: str) -> Row:
     """Return the row of one hand."""
     entries = {k: x for k, x in read_entries(folder).items() if isinstance(x, ObjectEntry)}
     tasks = [(folder, name, hand, o.seed, o.starts, o.simulator) for name in entries]
-    found = {
-        name: Outcome(*x)
-        for name, x in zip(entries, run_all(lift_body, tasks, o.workers, LIMIT), strict=True)
-    }
-    unit = {name: entry.family for name, entry in entries.items()}
-    risen, first, there = (
-        share_over(count_by((unit[k], good(x)) for k, x in found.items()))
-        for good in (
-            lambda x: x.tries > 0,
-            lambda x: x.tries == 1,
-            lambda x: x.tries_there > 0,
-        )
-    )
-    columns = [
-        count_by((unit[k], good > 0) for k, good in tries)
-        for tries in (
-            [(k, x.tries_there) for k, x in found.items()],
-            [(k, x.tries) for k, x in found.items()],
-        )
-    ]
-    gain = contrast_over(columns, (-1.0, 1.0))
+    outcomes = [Outcome(*x) for x in run_all(lift_body, tasks, o.workers, LIMIT)]
+    found = dict(zip(entries, outcomes, strict=True))
+    families = [entry.family for entry in entries.values()]
+    raised = count_by(zip(families, (x.tries > 0 for x in outcomes), strict=True))
+    at_once = count_by(zip(families, (x.tries == 1 for x in outcomes), strict=True))
+    in_place = count_by(zip(families, (x.tries_there > 0 for x in outcomes), strict=True))
+    gain = contrast_over([in_place, raised], (-1.0, 1.0))
+    risen, first, there = map(share_over, (raised, at_once, in_place))
     dragged = sum(x.where == "edge" for x in found.values())
     lost = {k: x.why for k, x in found.items() if not x.tries}
     words = f"up to three grasps {format_share(risen)}; the first {format_share(first)}; "

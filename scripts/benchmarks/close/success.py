@@ -26,6 +26,7 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
 from torchgrasp.success.model import MODEL
 from torchgrasp.success.promise import find_promise
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.specs import ContactSpec
 
 FRICTIONS = (0.3, 0.6, 0.8)
@@ -64,15 +65,8 @@ class Cell(NamedTuple):
 
 def table_spec(o: Options, representatives: bool) -> TableSpec:
     """Return the campaign that some options ask for, of one object of each family or of all."""
-    return TableSpec(
-        o.out,
-        o.objects,
-        only=o.names,
-        own=False,
-        representatives=representatives,
-        starts=o.starts,
-        seed=o.seed,
-    )
+    which = {"only": o.names, "own": False, "representatives": representatives}
+    return TableSpec(o.out, o.objects, **which, starts=o.starts, seed=o.seed)
 
 
 @bench("close/success", objects=True)
@@ -81,11 +75,10 @@ def success(o: Options) -> list[Row]:
     and promise.
     """
     spec = table_spec(o, representatives=False)
+    cases = itertools.product(enumerate(subjects(spec)), o.hands, enumerate(FRICTIONS))
     tasks = [
         (spec, subject, hand, friction, MASSES[(i + j) % len(MASSES)], o.simulator)
-        for (i, subject), hand, (j, friction) in itertools.product(
-            enumerate(subjects(spec)), o.hands, enumerate(FRICTIONS)
-        )
+        for (i, subject), hand, (j, friction) in cases
     ]
     return judge_tasks(tasks, o.workers)
 
@@ -118,7 +111,7 @@ def pull_at(
     base = PROTOCOLS["dexgraspbench"]
     model = load_hand(hand)
     solid = read_solid(subject)
-    patch = base.trial.patch * base.trial.friction / friction
+    patch = base.trial.patch * Distribution.of(base.trial.friction).mean / friction
     protocol = base.with_trial(friction=friction, mass=mass, patch=patch, simulator=simulator)
     contacts = ContactSpec(friction, table=Plane.horizontal(0.0))
     cloud = next(iter(solid.views.values()))
@@ -148,7 +141,8 @@ def judge_predictions(cells: list[Cell]) -> list[Row]:
         said = judge_trials(trials)
         bar = 0.04 if name == "all" else 0.08
         error = said["error"]
-        text = f"{error:.3f} of {len(trials)}: predicted {said['predicted']:.2f}, passed {said['passed']:.2f}"
+        text = f"{error:.3f} of {len(trials)}: predicted {said['predicted']:.2f}"
+        text += f", passed {said['passed']:.2f}"
         rows.append(Row(f"calibration error, {name}", f"<= {bar}", text, error <= bar, said))
     every = judge_trials([(cell.family, *x) for cell in cells for x in cell.tried])
     best = judge_trials([(cell.family, *x) for cell in cells for x in cell.best])
@@ -183,10 +177,8 @@ def judge_order(cells: list[Cell]) -> list[Row]:
         mine = [cell for cell in cells if cell.group == name]
         first = share_of(mine, lambda cell: cell.best[0][2])
         both = share_of(mine, lambda cell: any(x[2] for x in cell.best[:2]))
-        rows += [
-            bar_row(f"best one, {name}", one, first),
-            bar_row(f"within two tries, {name}", two, both),
-        ]
+        rows.append(bar_row(f"best one, {name}", one, first))
+        rows.append(bar_row(f"within two tries, {name}", two, both))
     return rows
 
 

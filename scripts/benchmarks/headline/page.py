@@ -13,14 +13,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.common import (
-    ROOT,
-    Options,
-    Row,
-    command_line,
-    describe_run,
-    format_rows,
-)
+from benchmarks.common import ROOT, Options, Row, command_line, describe_run, format_rows
 from torchgrasp import ContactSpec, Status, load_hand, load_object, plan_grasps
 from torchgrasp.evaluation.intervals import Share, format_share
 from torchgrasp.files import write_file
@@ -102,13 +95,8 @@ def golden_plans() -> dict[str, Any]:
 
 
 def _plan(name: str, hand: str) -> dict[str, Any]:
-    grasps = plan_grasps(
-        load_object(name).view,
-        load_hand(hand),
-        ContactSpec(friction=0.8, table=0.0),
-        STARTS,
-        seed=0,
-    )
+    spec = ContactSpec(friction=0.8, table=0.0)
+    grasps = plan_grasps(load_object(name).view, load_hand(hand), spec, STARTS, seed=0)
     kinds, counts = torch.unique(grasps.status, return_counts=True)
     statuses = {Status(int(k)).name: int(n) for k, n in zip(kinds, counts, strict=True)}
     return {

@@ -6,9 +6,10 @@ import dataclasses
 import statistics
 from pathlib import Path
 
+import numpy as np
 import torch
 import trimesh
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from benchmarks.common import Options, Row, bench, run_all
 from benchmarks.ground_truth import read_cameras, sample_hidden
@@ -81,9 +82,9 @@ def real(o: Options) -> list[Row]:
                 f"{name}_{camera}: median {view['median']:.1f} mm, 90 % {view['p90']:.1f} mm, "
                 f"within 2 std_m {view['within_2']:.2f}; the cameras differ by {floor:.1f} mm"
             )
-    words = (
-        f"{statistics.median(floors):.1f} mm in the median of views" if floors else "not measured"
-    )
+    words = "not measured"
+    if floors:
+        words = f"{statistics.median(floors):.1f} mm in the median of views"
     floor_row = Row("floor: distance of the cameras where both see", "-", words)
     hidden = _hidden(f"{len(found)} real views", found, "<= 3.0 mm")
     contacts = [contact_row(name, clouds, TABLE, o) for name in o.hands]
@@ -135,7 +136,7 @@ def judge_hidden(
 
     All is NaN if the view is refused.
     """
-    far = torch.from_numpy(cKDTree(seen.numpy()).query(measured.numpy())[0]) > UNSEEN
+    far = torch.from_numpy(KDTree(seen.numpy()).query(measured.numpy())[0]) > UNSEEN
     hidden = measured[far]
     hidden = hidden[:: max(1, len(hidden) // QUERIES)]
     try:
@@ -168,9 +169,9 @@ def measure_floor(seen: torch.Tensor, measured: torch.Tensor) -> float:
     """
     view = estimate_normals(PointCloud(seen))
     assert view.normals is not None
-    away, rows = cKDTree(view.points.numpy()).query(measured.numpy())
+    away, rows = KDTree(view.points.numpy()).query(measured.numpy())
     both = away < UNSEEN
-    rows = rows[both]
+    rows = np.asarray(rows)[both]
     offset = measured[both] - view.points[rows]
     height = (offset * view.normals[rows]).sum(1).abs()
     return 1e3 * float(height.median()) if len(height) else float("nan")

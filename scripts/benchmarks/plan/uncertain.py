@@ -6,7 +6,6 @@ quantiles of the distribution. Bodies are of families that fitted no tree of the
 Masses and simulators alternate from body to body. Intervals are over families.
 """
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable
@@ -221,20 +220,10 @@ def describe(found: list[Outcome]) -> list[Row]:
         behind = held[HALF] - max(held.values())
         error = errors(cells[regime, HALF])
         bar = 0.05 if regime in SURE else 0.1
-        rows += [
-            Row(
-                f"friction {regime}: held, {HALF} minus the best rule",
-                ">= -0.02",
-                f"{behind:+.3f}",
-                behind >= -0.02,
-            ),
-            Row(
-                f"friction {regime}: predicted minus held, {HALF}",
-                f"<= {bar}",
-                format_number(error),
-                abs(error.value) <= bar,
-            ),
-        ]
+        what = f"friction {regime}: held, {HALF} minus the best rule"
+        rows.append(Row(what, ">= -0.02", f"{behind:+.3f}", behind >= -0.02))
+        what = f"friction {regime}: predicted minus held, {HALF}"
+        rows.append(Row(what, f"<= {bar}", format_number(error), abs(error.value) <= bar))
     every = {rule: [x for r in REGIMES for x in cells[r, rule]] for rule in RULES}
     for rule in (MEAN, LOWEST, NUMBER):
         gain = contrast_over([sum_by(held_of(every[x])) for x in (HALF, rule)], [1.0, -1.0])
@@ -242,28 +231,16 @@ def describe(found: list[Outcome]) -> list[Row]:
         met = gain.value >= GAIN and gain.low > 0 if rule == NUMBER else None
         rows.append(Row(f"held, {HALF} minus {rule}", target, format_number(gain), met))
     refused = {rule: sum(not x.executable for x in every[rule]) for rule in RULES}
-    rows.append(
-        Row(
-            f"plans without a grasp, of {len(every[HALF])}",
-            f"{HALF} <= {MEAN}",
-            ", ".join(f"{rule} {n}" for rule, n in refused.items()),
-            refused[HALF] <= refused[MEAN],
-        )
-    )
+    what = f"plans without a grasp, of {len(every[HALF])}"
+    text = ", ".join(f"{rule} {n}" for rule, n in refused.items())
+    rows.append(Row(what, f"{HALF} <= {MEAN}", text, refused[HALF] <= refused[MEAN]))
     promised = [x for x in found if x.regime == PROMISED]
     kept = mean_over((x.family, x.held) for x in promised)
     answered = sum(x.executable > 0 for x in promised)
-    rows.append(
-        Row(
-            f"friction {PROMISED}, promise {PROMISE}: held where returned",
-            ">= 0.9",
-            f"{format_number(kept, sign='')}, {answered} of {len(promised)} bodies answered",
-            kept.value >= PROMISE,
-        )
-    )
+    what = f"friction {PROMISED}, promise {PROMISE}: held where returned"
+    text = f"{format_number(kept, sign='')}, {answered} of {len(promised)} bodies answered"
     numbers = {"outcomes": [x._asdict() for x in found]}
-    rows[-1] = dataclasses.replace(rows[-1], numbers=numbers)
-    return rows
+    return [*rows, Row(what, f">= {PROMISE}", text, kept.value >= PROMISE, numbers)]
 
 
 def describe_cell(regime: str, rule: str, cell: list[Outcome]) -> Row:

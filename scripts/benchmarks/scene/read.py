@@ -49,7 +49,10 @@ def understand(room: Room) -> Understood:
         lone = dict.fromkeys(room.lone(), "missed")
         return Understood(math.inf, math.inf, False, lone, (), time.process_time() - began)
     seconds = time.process_time() - began
-    errors = [_table_error(plane, room) for plane in scene.supports]
+    true = room.table_in_camera
+    # in the middle of the room's things
+    middle = torch.linalg.inv(room.camera_pose)[:3, 3]
+    errors = [plane_error(plane, true.normal, middle) for plane in scene.supports]
     labels = torch.zeros_like(room.labels)
     labels[tuple(scene.pixels.T)] = scene.labels
     extra = []
@@ -63,13 +66,15 @@ def understand(room: Room) -> Understood:
     return Understood(*errors[0], offered, lone, tuple(extra), seconds)
 
 
-def _table_error(plane: Plane, room: Room) -> tuple[float, float]:
-    """Return the errors of a table [degrees, mm], at the middle of the room's things."""
-    true = room.table_in_camera
-    middle = torch.linalg.inv(room.camera_pose)[:3, 3]
-    return math.degrees(math.acos(min(1.0, float(plane.normal @ true.normal)))), 1e3 * abs(
-        float(plane.height(middle))
-    )
+def plane_error(
+    plane: Plane, normal: Tensor, at: Tensor, height: float = 0.0
+) -> tuple[float, float]:
+    """Return the angle [deg] of a plane to the true normal (3,), and the error [mm] of the `height`
+    [m] of a point (3,) above it.
+    """
+    cosine = float(plane.normal.double() @ normal.double())
+    found = float(plane.height(at.double()))
+    return math.degrees(math.acos(min(1.0, cosine))), 1e3 * abs(found - height)
 
 
 def _fate(labels: Int[Tensor, "h w"], true: Tensor) -> str:
@@ -93,43 +98,31 @@ def look_around(o: Options) -> list[Row]:
         (room, understand(room))
         for room in map(rooms, tqdm(scenes, desc="rooms", disable=None, leave=False))
     ]
-    fates = Counter(fate for _, one in seen for fate in one.lone.values())
-    wrong = [f"{room.kind} {room.sensor}" for room, one in seen if not one.right]
-    extra = Counter(part for _, one in seen for part, _ in one.extra)
-    seconds = sorted(one.seconds for _, one in seen)
-    median = seconds[len(seconds) // 2]
-    offered = sum(one.offered for _, one in seen)
     found = {
         i: (room.kind, room.sensor, dataclasses.asdict(one))
         for i, (room, one) in zip(scenes, seen, strict=True)
     }
-    return [
-        Row(
-            f"table, {len(seen)} rendered rooms, RealSense, Kinect v1, Azure Kinect, Zivid",
-            "the first one within 2 degrees and 10 mm, all",
-            f"{len(seen) - len(wrong)} first, {offered} offered; wrong: {', '.join(wrong) or 'none'}",
-            not wrong,
-            {"rooms": found},
-        ),
-        Row(
-            "lone things in the rooms",
-            "each is one thing, 98 %",
-            ", ".join(f"{fates[fate]} {fate}" for fate in ("one", "split", "joined", "missed")),
-            fates["one"] >= 0.98 * fates.total(),
-            {"fates": dict(fates)},
-        ),
-        Row(
-            "objects of more than 100 pixels that are no things",
-            "none",
-            ", ".join(f"{count} {part}" for part, count in sorted(extra.items())) or "none",
-            not extra,
-            {"extra": dict(extra)},
-        ),
-        Row(
-            "depth image of 640 x 480 to scene in a room",
-            "<= 0.5 s, median",
-            f"median {median:.2f} s, largest {seconds[-1]:.2f} s",
-            median <= 0.5,
-            {"seconds": seconds},
-        ),
-    ]
+    wrong = [f"{room.kind} {room.sensor}" for room, one in seen if not one.right]
+    offered = sum(one.offered for _, one in seen)
+    what = f"table, {len(seen)} rendered rooms, RealSense, Kinect v1, Azure Kinect, Zivid"
+    bar = "the first one within 2 degrees and 10 mm, all"
+    text = f"{len(seen) - len(wrong)} first, {offered} offered; wrong: {', '.join(wrong) or 'none'}"
+    table = Row(what, bar, text, not wrong, {"rooms": found})
+
+    fates = Counter(fate for _, one in seen for fate in one.lone.values())
+    text = ", ".join(f"{fates[fate]} {fate}" for fate in ("one", "split", "joined", "missed"))
+    good = fates["one"] >= 0.98 * fates.total()
+    bar = "each is one thing, 98 %"
+    lone = Row("lone things in the rooms", bar, text, good, {"fates": dict(fates)})
+
+    extra = Counter(part for _, one in seen for part, _ in one.extra)
+    text = ", ".join(f"{count} {part}" for part, count in sorted(extra.items())) or "none"
+    what = "objects of more than 100 pixels that are no things"
+    others = Row(what, "none", text, not extra, {"extra": dict(extra)})
+
+    seconds = sorted(one.seconds for _, one in seen)
+    median = seconds[len(seconds) // 2]
+    text = f"median {median:.2f} s, largest {seconds[-1]:.2f} s"
+    what = "depth image of 640 x 480 to scene in a room"
+    took = Row(what, "<= 0.5 s, median", text, median <= 0.5, {"seconds": seconds})
+    return [table, lone, others, took]

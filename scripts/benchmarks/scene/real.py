@@ -18,6 +18,7 @@ from PIL import Image
 from scipy.ndimage import affine_transform
 
 from benchmarks.common import Options, Row, bench
+from benchmarks.scene.read import plane_error
 from torchgrasp import Scene
 from torchgrasp.foundation.errors import NoSupport
 from torchgrasp.geometry.plane import Plane
@@ -37,6 +38,10 @@ DEGREES, MM = 2.0, 10.0
 HOME = "home"
 HOME_DEGREES, HOME_MM = 4.0, 20.0
 """Names of frames of homes begin so; bounds of their supports, which bow."""
+FATES = ("right", "offered", "vertical", "wrong", "refused")
+"""What becomes of the support in a variant."""
+KEPT = 0.95
+"""Intersection over union of a mask that is kept."""
 
 
 @bench("scene/real", objects=True)
@@ -54,58 +59,39 @@ def real(o: Options) -> list[Row]:
         name: Scene.from_depth(read(folder, name, "depth"), frames[name]["intrinsics"])
         for name in names
     }
-    errors = {name: support_error(scene, frames[name]) for name, scene in scenes.items()}
-    right = sum(
-        tilt < bounds_of(name)[0] and offset < bounds_of(name)[1]
-        for name, (tilt, offset) in errors.items()
-    )
+    errors = {name: support_errors(x.supports[:1], frames[name])[0] for name, x in scenes.items()}
+    right = sum(is_right(name, error) for name, error in errors.items())
     worst = [max(error[k] for error in errors.values()) for k in (0, 1)]
-    found = {name: (frames[name]["things"], len(scene.things)) for name, scene in scenes.items()}
-    same = sum(true == seen for true, seen in found.values())
-    text = ", ".join(f"{name} {true}: {seen}" for name, (true, seen) in found.items())
-    kept = [share for name in names for share in kept_shares(folder, name, frames[name])]
-    good = sum(share >= 0.95 for share in kept)
-    support = f"{right} of {len(names)}; largest {worst[0]:.1f} degrees, {worst[1]:.1f} mm"
+    bar = "within 2 degrees and 10 mm, in homes 4 degrees and 20 mm, all"
+    text = f"{right} of {len(names)}; largest {worst[0]:.1f} degrees, {worst[1]:.1f} mm"
+    support = Row("support of real frames", bar, text, right == len(names), errors)
+
     varied = [
         judge_variant(folder, name, frames[name], [o.seed, i, k])
         for i, name in enumerate(names)
         for k in range(VARIANTS)
     ]
-    good_ones = varied.count("right")
-    fates = ", ".join(
-        f"{varied.count(fate)} {fate}"
-        for fate in ("right", "offered", "vertical", "wrong", "refused")
+    fates = ", ".join(f"{varied.count(fate)} {fate}" for fate in FATES)
+    what = f"the same frames, mirrored, turned by up to {ROLL:g} degrees, cut and with noise"
+    good = varied.count("right") == len(varied)
+    text = f"of {len(varied)}: {fates}"
+    variants = Row(what, "the same, all", text, good, {"varied": varied})
+
+    found = {name: (frames[name]["things"], len(scene.things)) for name, scene in scenes.items()}
+    same = sum(true == seen for true, seen in found.values())
+    text = ", ".join(f"{name} {true}: {seen}" for name, (true, seen) in found.items())
+    text = f"{same} equal; {text}"
+    bar = "true number: found, all equal"
+    objects = Row("objects of real frames", bar, text, same == len(names), found)
+
+    kept = [share for name in names for share in kept_shares(folder, name, frames[name])]
+    others = ", ".join(f"{share:.2f}" for share in kept if share < KEPT)
+    text = f"{sum(share >= KEPT for share in kept)} of {len(kept)}; the others {others}"
+    what = (
+        "true labels given as masks; labels of table and walls are among them, and must be trimmed"
     )
-    return [
-        Row(
-            "support of real frames",
-            "within 2 degrees and 10 mm, in homes 4 degrees and 20 mm, all",
-            support,
-            right == len(names),
-            errors,
-        ),
-        Row(
-            f"the same frames, mirrored, turned by up to {ROLL:g} degrees, cut and with noise",
-            "the same, all",
-            f"of {len(varied)}: {fates}",
-            good_ones == len(varied),
-            {"varied": varied},
-        ),
-        Row(
-            "objects of real frames",
-            "true number: found, all equal",
-            f"{same} equal; {text}",
-            same == len(names),
-            found,
-        ),
-        Row(
-            "true labels given as masks; labels of table and walls are among them, and must be trimmed",
-            "intersection over union >= 0.95",
-            f"{good} of {len(kept)}; the others {', '.join(f'{share:.2f}' for share in kept if share < 0.95)}",
-            None,
-            {"shares": kept},
-        ),
-    ]
+    masks = Row(what, f"intersection over union >= {KEPT}", text, None, {"shares": kept})
+    return [support, variants, objects, masks]
 
 
 def read(folder: Path, name: str, kind: str) -> np.ndarray:
@@ -113,24 +99,21 @@ def read(folder: Path, name: str, kind: str) -> np.ndarray:
     return np.asarray(Image.open(folder / f"{name}_{kind}.png"))
 
 
-def bounds_of(name: str) -> tuple[float, float]:
-    """Return the greatest angle [deg] and error [mm] of the right support of a frame."""
-    return (HOME_DEGREES, HOME_MM) if name.startswith(HOME) else (DEGREES, MM)
+def is_right(name: str, error: tuple[float, float]) -> bool:
+    """Tell whether a support of a frame is the true one, by its angle [deg] and its error [mm]."""
+    degrees, mm = (HOME_DEGREES, HOME_MM) if name.startswith(HOME) else (DEGREES, MM)
+    return error[0] < degrees and error[1] < mm
 
 
-def support_error(scene: Scene, frame: dict[str, Any]) -> tuple[float, float]:
-    """Return the tilt [deg] of the support, and the error [mm] of the camera's height above it."""
-    assert scene.table is not None
-    return plane_error(scene.table, frame["table_normal"], frame["camera_over_table_m"])
-
-
-def plane_error(plane: Plane, normal: Sequence[float], height: float) -> tuple[float, float]:
-    """Return the angle [deg] of a plane to the true normal, and the error [mm] of the camera's
-    `height` [m] above it.
+def support_errors(
+    supports: Sequence[Plane], frame: dict[str, Any], normal: Sequence[float] = ()
+) -> list[tuple[float, float]]:
+    """Return the angle [deg] of each support to the `normal`, by default that of the frame, and the
+    error [mm] of the camera's height above it.
     """
-    cosine = float(plane.normal.double() @ torch.tensor(normal, dtype=torch.float64))
-    found = float(plane.height(torch.zeros(3, dtype=torch.float64)))
-    return math.degrees(math.acos(min(1.0, cosine))), 1e3 * abs(found - height)
+    true = torch.tensor(normal or frame["table_normal"], dtype=torch.float64)
+    camera = torch.zeros(3, dtype=torch.float64)
+    return [plane_error(x, true, camera, frame["camera_over_table_m"]) for x in supports]
 
 
 def judge_variant(folder: Path, name: str, frame: dict[str, Any], seed: list[int]) -> str:
@@ -144,9 +127,8 @@ def judge_variant(folder: Path, name: str, frame: dict[str, Any], seed: list[int
         supports = Scene.from_depth(depth, intrinsics).supports
     except NoSupport:
         return "refused"
-    degrees, mm = bounds_of(name)
-    errors = [plane_error(x, normal, frame["camera_over_table_m"]) for x in supports]
-    right = [angle < degrees and error < mm for angle, error in errors]
+    errors = support_errors(supports, frame, normal)
+    right = [is_right(name, error) for error in errors]
     if any(right):
         return "right" if right[0] else "offered"
     return "vertical" if errors[0][0] > VERTICAL else "wrong"
@@ -154,7 +136,7 @@ def judge_variant(folder: Path, name: str, frame: dict[str, Any], seed: list[int
 
 def vary(
     folder: Path, name: str, frame: dict[str, Any], draw: np.random.Generator
-) -> tuple[np.ndarray, list[float], np.ndarray]:
+) -> tuple[np.ndarray, list[float], list[float]]:
     """Return a frame's depth image, turned about the camera's axis, cut, perhaps mirrored and with
     noise; its intrinsics, with the size of the image; and the true normal in its camera's frame.
     """
@@ -165,7 +147,7 @@ def vary(
     # of (row, column), about the principal point
     turn = np.array([[cosine, -sine], [sine, cosine]])
     middle = np.array([cy, cx])
-    turned = affine_transform(depth, turn, middle - turn @ middle, order=0)
+    turned = affine_transform(depth, np.c_[turn, middle - turn @ middle], order=0)
     # of (x, y, z): from the frame as it was to the turned one
     axes = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     normal = axes @ np.array(frame["table_normal"])
@@ -180,7 +162,7 @@ def vary(
         intrinsics[2] = width - 1 - intrinsics[2]
         normal = normal * [-1.0, 1.0, 1.0]
     noise = NOISE / 1000 * image**2 * draw.normal(size=image.shape)  # images are in millimetres
-    return (image + noise).clip(0).astype(depth.dtype), intrinsics, normal
+    return (image + noise).clip(0).astype(depth.dtype), intrinsics, normal.tolist()
 
 
 def kept_shares(folder: Path, name: str, frame: dict[str, Any]) -> list[float]:

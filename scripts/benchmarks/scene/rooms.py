@@ -4,7 +4,6 @@ boards.
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -141,7 +140,7 @@ def _rectangular(rng: np.random.Generator) -> Furniture:
     wide = rng.uniform(0.4, 0.6)
     high = rng.uniform(0.4, 0.75)
     top = _box([wide, long, 0.03], [0, 0, -0.015])
-    parts = [("table", top), ("floor", _floor(-high)), ("wall", _wall(-rng.uniform(0.8, 1.4)))]
+    parts = [("table", top), ("floor", _floor(-high)), ("wall", _panel(-rng.uniform(0.8, 1.4)))]
     return Furniture(parts, wide / 2 - 0.03, ((-45, 45), (25, 50), (0.7, 1.1)))
 
 
@@ -156,9 +155,9 @@ def _holes(rng: np.random.Generator) -> Furniture:
     return Furniture(parts, 0.25, ((0, 360), (35, 55), (0.6, 0.9)))
 
 
-def _wall_table(rng: np.random.Generator) -> Furniture:
+def _wall(rng: np.random.Generator) -> Furniture:
     top = _box([0.7, 1.4, 0.03], [0, 0, -0.015])
-    parts = [("table", top), ("wall", _wall(-rng.uniform(0.25, 0.34)))]
+    parts = [("table", top), ("wall", _panel(-rng.uniform(0.25, 0.34)))]
     return Furniture(parts, 0.22, ((-35, 35), (25, 45), (0.6, 0.9)))
 
 
@@ -178,7 +177,7 @@ def _shelf(rng: np.random.Generator) -> Furniture:
     top = _box([0.35, 0.9, 0.02], [0, 0, -0.01])
     board = _box([0.35, 0.9, 0.02], [0, 0, gap + 0.01])
     side = _box([0.35, 0.02, gap], [0, 0.44, gap / 2])
-    parts = [("table", top), ("board", board), ("wall", _wall(-0.18)), ("side", side)]
+    parts = [("table", top), ("board", board), ("wall", _panel(-0.18)), ("side", side)]
     parts.append(("floor", _floor(-0.6)))
     return Furniture(parts, 0.15, ((-30, 30), (15, 25), (0.6, 0.9)))
 
@@ -193,7 +192,10 @@ def _board(rng: np.random.Generator) -> Furniture:
 
 
 def _ground(rng: np.random.Generator) -> Furniture:
-    parts = [("table", _box([3, 3, 0.01], [0, 0, -0.005])), ("wall", _wall(-rng.uniform(0.6, 1.2)))]
+    parts = [
+        ("table", _box([3, 3, 0.01], [0, 0, -0.005])),
+        ("wall", _panel(-rng.uniform(0.6, 1.2))),
+    ]
     return Furniture(parts, 0.25, ((-45, 45), (30, 55), (0.7, 1.0)))
 
 
@@ -203,17 +205,8 @@ def _above(rng: np.random.Generator) -> Furniture:
     return Furniture(parts, 0.22, ((0, 360), (78, 89), (0.6, 0.9)))
 
 
-KINDS: dict[str, Callable[[np.random.Generator], Furniture]] = {
-    "round": _round,
-    "rectangular": _rectangular,
-    "holes": _holes,
-    "wall": _wall_table,
-    "bin": _bin,
-    "shelf": _shelf,
-    "board": _board,
-    "ground": _ground,
-    "above": _above,
-}
+MAKERS = (_round, _rectangular, _holes, _wall, _bin, _shelf, _board, _ground, _above)
+KINDS = {make.__name__.removeprefix("_"): make for make in MAKERS}
 """Kinds of rooms: a round or rectangular table over a floor, a plate with holes, a table at a wall,
 a bin, a shelf, a tilted board, the ground itself, and a table from above.
 """
@@ -233,7 +226,7 @@ def _floor(height: float) -> trimesh.Trimesh:
     return _box([4, 4, 0.01], [0, 0, height - 0.005])
 
 
-def _wall(x: float) -> trimesh.Trimesh:
+def _panel(x: float) -> trimesh.Trimesh:
     return _box([0.02, 4, 3], [x - 0.01, 0, 0.5])
 
 
@@ -252,8 +245,9 @@ def _things(
     """Return the names and the meshes of one to five random things that stand apart on z = 0."""
     count = int(rng.integers(1, 6))
     while True:
-        names = [str(name) for name in rng.choice(list(THINGS), count)]
-        meshes = [THINGS[name](rng) for name in names]
+        makers = [THINGS[k] for k in rng.choice(len(THINGS), count)]
+        names = [make.__name__.removeprefix("_") for make in makers]
+        meshes = [make(rng) for make in makers]
         try:
             poses = scatter(meshes, generator, radius, 0.02)
         except BadArgument:
@@ -331,15 +325,5 @@ def _bridge(rng: np.random.Generator) -> trimesh.Trimesh:
     return _join(*legs, _box([span + 0.02, 0.04, 0.02], [0, 0, high - 0.01]))
 
 
-THINGS: dict[str, Callable[[np.random.Generator], trimesh.Trimesh]] = {
-    "brick": _brick,
-    "tin": _tin,
-    "ball": _ball,
-    "mug": _mug,
-    "bowl": _bowl,
-    "glass": _glass,
-    "bottle": _bottle,
-    "ring": _ring,
-    "bridge": _bridge,
-}
+THINGS = (_brick, _tin, _ball, _mug, _bowl, _glass, _bottle, _ring, _bridge)
 """Things of random sizes, which stand at z = 0."""

@@ -22,10 +22,8 @@ def scatter(
     `gap` [m] apart. Meshes that do not fit raise `BadArgument`.
     """
     outlines = [footprint(mesh) for mesh in meshes]
-    largest_first = sorted(
-        range(len(meshes)),
-        key=lambda i: -float(torch.linalg.vector_norm(outlines[i], dim=-1).max()),
-    )
+    sizes = [float(torch.linalg.vector_norm(outline, dim=-1).max()) for outline in outlines]
+    largest_first = sorted(range(len(meshes)), key=lambda i: -sizes[i])
     for _ in range(50):
         placed: dict[int, tuple[Float[Tensor, "4 4"], Float[Tensor, "k 2"]]] = {}
         for i in largest_first:
@@ -41,11 +39,8 @@ def scatter(
                 break
         if len(placed) == len(meshes):
             return torch.stack([placed[i][0] for i in range(len(meshes))])
-    raise BadArgument(
-        "radius",
-        f"{radius:g} m for {len(meshes)} meshes",
-        "a circle that holds them, with their gaps",
-    )
+    given = f"{radius:g} m for {len(meshes)} meshes"
+    raise BadArgument("radius", given, "a circle that holds them, with their gaps")
 
 
 def _random_pose(height: float, generator: torch.Generator, radius: float) -> Float[Tensor, "4 4"]:
@@ -54,9 +49,8 @@ def _random_pose(height: float, generator: torch.Generator, radius: float) -> Fl
     distance = radius * math.sqrt(share)
     angle = 2 * math.pi * angle
     position = [distance * math.cos(angle), distance * math.sin(angle), height]
-    rotation = rotation_from_vector(
-        torch.tensor([0.0, 0.0, 2 * math.pi * turn], dtype=torch.float64)
-    )
+    about_z = torch.tensor([0.0, 0.0, 2 * math.pi * turn], dtype=torch.float64)
+    rotation = rotation_from_vector(about_z)
     return rigid(rotation, torch.tensor(position, dtype=torch.float64))
 
 

@@ -146,18 +146,19 @@ def target(o: Options) -> list[Row]:
 def try_scene(o: Options, k: int, hand: str) -> list[dict[str, Any]]:
     """Return the fields of the tries of one scene; kept ones are read."""
     path = o.out / "target" / f"{hand}_{o.starts}_{o.simulator}_{k:03d}.json"
-    return keep(path, lambda: [dataclasses.asdict(x) for x in _try_scene(o, k, hand)])
+
+    def try_ways() -> list[dict[str, Any]]:
+        clutter = make_clutter(np.random.default_rng([o.seed, k]), k)
+        return [dataclasses.asdict(try_target(clutter, k, way, hand, o)) for way in WAYS]
+
+    return keep(path, try_ways)
 
 
 def read_try(outcome: dict[str, Any]) -> TargetTry:
     """Return a try from a file, in which a success that is unknown is null."""
-    predicted = math.nan if outcome["predicted"] is None else outcome["predicted"]
-    return TargetTry(**outcome | {"predicted": predicted})
-
-
-def _try_scene(o: Options, k: int, hand: str) -> list[TargetTry]:
-    clutter = make_clutter(np.random.default_rng([o.seed, k]), k)
-    return [try_target(clutter, k, way, hand, o) for way in WAYS]
+    if outcome["predicted"] is None:
+        outcome = outcome | {"predicted": math.nan}
+    return TargetTry(**outcome)
 
 
 def make_clutter(draw: np.random.Generator, k: int) -> Clutter:
@@ -262,8 +263,8 @@ def try_target(clutter: Clutter, k: int, way: str, hand: str, o: Options) -> Tar
 
 def middle_of(mask: Tensor) -> tuple[int, int]:
     """Return the pixel (u, v) that is farthest from the rim of a mask."""
-    depth = distance_transform_edt(mask.numpy())
-    row, column = np.unravel_index(int(np.argmax(depth)), mask.shape)
+    away = np.asarray(distance_transform_edt(mask.numpy()))
+    row, column = np.unravel_index(int(away.argmax()), mask.shape)
     return int(column), int(row)
 
 
@@ -275,13 +276,9 @@ def lift_target(
     if best is None or best.grasps is None:
         reasons = "; ".join(dict.fromkeys(x.reason for x in plan.things if x.reason))
         return dataclasses.replace(told, said=reasons, clear=len(plan.clear))
-    around = [
-        Neighbour(mesh, parts)
-        for mesh, parts in zip(clutter.meshes[1:], clutter.parts[1:], strict=True)
-    ]
-    truth = Truth(
-        clutter.meshes[0], clutter.parts[0], table=Plane.horizontal(0.0), neighbours=around
-    )
+    target, *around = map(Neighbour, clutter.meshes, clutter.parts)
+    table = Plane.horizontal(0.0)
+    truth = Truth(target.mesh, target.parts, table=table, neighbours=around)
     closed = lift_grasp(GraspTrial(load_hand(hand), best.grasps[0], truth, seed), trial)
     assert closed.disturbance is not None
     return dataclasses.replace(
@@ -318,46 +315,34 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
         f"{low:.2f} to {high:.2f}: {describe_group([x for x in tries if low <= x.hidden < high])}"
         for low, high in itertools.pairwise(HIDDEN)
     )
-    bar = BARS[way]
+    least = BARS[way]
     asking = way == "click"
-    first = good if asking else held
+    what = f"target by {way}"
     words = f"held {format_share(held)}; held or asked {format_share(good)}; "
-    words += f"held, asked or told in the scene's advice {format_share(wary)}"
+    words += f"held, asked or told in the scene's advice {format_share(wary)}; "
+    words += f"held of planned {format_share(of_planned)}"
+    bar = f">= {least:.0%} held" + (" or asked" if asking else "")
+    met = (good if asking else held).value >= least
+    lifted = Row(what, bar, words, met, {"tries": [dataclasses.asdict(x) for x in tries]})
+
+    what += "; an unknown success, told with its cause, counts as asked"
+    words = f"held, asked or told that success is unknown {format_share(frank)}; success unknown: "
+    words += f"{len(unknown)}, of which {sum(x.held for x in unknown)} held; of those with a known "
+    words += f"success {sum(x.held for x in promised)} of {len(promised)} held"
+    told = Row(what, bar if asking else "-", words, frank.value >= least if asking else None)
+
+    what = f"a neighbour moved by more than 2 cm, {way}"
+    beside = Row(what, "<= 4 %", format_share(pushed, "scenes"), pushed.value <= 0.04)
+    what = f"predicted minus held, {way}"
+    predicted = Row(what, "<= 0.05", format_number(error), abs(error.value) <= 0.05)
+    hidden = Row(f"by the share hidden, {way}", "-", by_hidden)
+
     whole = sum(x.share >= KEPT for x in tries)
     pure = sum(x.purity >= KEPT for x in tries)
-    kept = f"{whole} of {len(tries)} keep {KEPT:.0%} of the target's measured pixels; "
-    kept += f"{pure} hold {KEPT:.0%} of the target's own"
-    return [
-        Row(
-            f"target by {way}",
-            f">= {bar:.0%} held" + (" or asked" if asking else ""),
-            f"{words}; held of planned {format_share(of_planned)}",
-            first.value >= bar,
-            {"tries": [dataclasses.asdict(x) for x in tries]},
-        ),
-        Row(
-            f"target by {way}; an unknown success, told with its cause, counts as asked",
-            f">= {bar:.0%} held or asked" if asking else "-",
-            f"held, asked or told that success is unknown {format_share(frank)}; success unknown: "
-            f"{len(unknown)}, of which {sum(x.held for x in unknown)} held; of those with a known "
-            f"success {sum(x.held for x in promised)} of {len(promised)} held",
-            frank.value >= bar if asking else None,
-        ),
-        Row(
-            f"a neighbour moved by more than 2 cm, {way}",
-            "<= 4 %",
-            format_share(pushed, "scenes"),
-            pushed.value <= 0.04,
-        ),
-        Row(
-            f"predicted minus held, {way}",
-            "<= 0.05",
-            format_number(error),
-            abs(error.value) <= 0.05,
-        ),
-        Row(f"by the share hidden, {way}", "-", by_hidden),
-        Row(f"pixels taken for the target, {way}", "-", kept),
-    ]
+    words = f"{whole} of {len(tries)} keep {KEPT:.0%} of the target's measured pixels; "
+    words += f"{pure} hold {KEPT:.0%} of the target's own"
+    pixels = Row(f"pixels taken for the target, {way}", "-", words)
+    return [lifted, told, beside, predicted, hidden, pixels]
 
 
 def describe_group(tries: Sequence[TargetTry]) -> str:

@@ -1,1 +1,0 @@
-"""Kernels on a GPU beside the CPU."""
