@@ -5,6 +5,8 @@
 
 * headline: lifts, low, pulls, region, rendered, real, pace: what README says; --publish writes it
 
+* gpu: clouds, launches: many clouds at once, also without a GPU
+
 * plan: pace, uncertain: time to grasps, uncertain friction
 
 * scene: real, rooms, target: supports and things in depth images, a given thing among others
@@ -21,7 +23,7 @@ import tyro
 from benchmarks.common import Options, measure
 from benchmarks.headline.page import write_headline
 
-SUBJECTS = ("close", "headline", "plan", "scene")
+SUBJECTS = ("close", "gpu", "headline", "plan", "scene")
 
 
 def command(subject: str) -> Callable[[Options], None]:

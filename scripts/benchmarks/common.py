@@ -68,6 +68,7 @@ class Options:
         hands: names of hands.
         conditions: of close/table-lift; by default all.
         starts: random starts of the contact planner.
+        batches: numbers of clouds of gpu/clouds and gpu/launches.
         scale: factor of the numbers of random samples, scenes, frames, plans and trials.
         draws: trials of each grasp of close/table-lift, with other displacements and noise.
         clouds: folder of real clouds NAME_CAMERA.ply for headline/real, of one camera each.
@@ -88,6 +89,7 @@ class Options:
     hands: tuple[str, ...] = ("allegro", "barrett")
     conditions: tuple[str, ...] = ()
     starts: int = 1000
+    batches: tuple[int, ...] = (1, 4, 16)
     scale: float = 1.0
     draws: int = 5
     clouds: Path | None = None

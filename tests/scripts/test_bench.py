@@ -23,7 +23,7 @@ from torchgrasp import PointCloud, fit_shape
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.geometry.linalg import unit
 
-RUNS = ("scene/rooms",)
+RUNS = ("gpu/launches", "scene/rooms")
 SIMULATED = ("headline/region",)
 SHORT = {"hold_time": 0.1, "control_rate": 50.0}
 """Trials whose verdicts do not matter."""
@@ -42,6 +42,7 @@ def test_bench_writes_its_rows(name, tin, tmp_path, monkeypatch):
         ("tin",),
         hands=("barrett",),
         starts=8,
+        batches=(1,),
         scale=2e-4,
         workers=0,
         out=tmp_path / "out",

@@ -1,0 +1,1 @@
+"""Kernels on a GPU beside the CPU."""
