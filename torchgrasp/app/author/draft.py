@@ -31,7 +31,12 @@ from torchgrasp.app.author.repair import (
     repair_bodies,
     repair_joints,
 )
-from torchgrasp.app.author.sensor_tips import add_seen_sensors, add_sensors, extend_pads
+from torchgrasp.app.author.sensor_tips import (
+    add_seen_sensors,
+    add_sensors,
+    extend_pads,
+    find_sensors,
+)
 from torchgrasp.app.author.unusual import find_unusual
 from torchgrasp.app.author.visuals import keep_visuals, mesh_files
 from torchgrasp.files import render, temporary_folder
@@ -219,9 +224,10 @@ def _draft(
 
     clean, fitted = replace_meshes(urdf, reduced.points)
     clean, balls = _round_tips(urdf, clean, tips, guess, surfaces)
-    clean, sensors = add_sensors(clean, tips, guess, pads)
+    sensors = find_sensors(tips, guess, pads)
+    clean, extended = add_sensors(clean, sensors)
     told = origin.told if origin else ()
-    repairs = [*told, *reduced.repairs, *fitted, *sensors, *balls]
+    repairs = [*told, *reduced.repairs, *fitted, *extended, *balls]
     warnings = [*(origin.warnings if origin else ()), *reduced.unusual]
     if bare and wish.visual:
         repairs.append(f"links without <collision> take their <visual>: {', '.join(bare)}")
@@ -241,7 +247,7 @@ def _draft(
     if not repairs:
         return Draft(toml, "", (), tuple(warnings))
     seen = keep_visuals(published, clean, reduced.mergers, folder)
-    files = mesh_files(add_seen_sensors(seen, tips, guess, pads))
+    files = mesh_files(add_seen_sensors(seen, sensors))
     text = _urdf_text(clean, {link: (name,) for link, (name, _) in files.items()})
     return Draft(toml, text, tuple(repairs), tuple(warnings), dict(files.values()))
 

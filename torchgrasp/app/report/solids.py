@@ -85,16 +85,11 @@ def solids_by_link(hand: Hand) -> dict[str, Solid]:
         mine = [solid for solid in solids if solid.link == link]
         if not mine:
             continue
-        # the faces of each shape count its vertices after those of the shapes before
-        starts = np.cumsum([0, *(len(s.vertices) for s in mine)])
-        faces = [s.faces + start for s, start in zip(mine, starts, strict=False)]
-        found[name] = Solid(
-            np.concatenate([s.vertices for s in mine]),
-            np.concatenate(faces),
-            np.concatenate([s.normals for s in mine]),
-            link,
-            mine[0].finger,
+        vertices, faces = trimesh.util.append_faces(
+            [s.vertices for s in mine], [s.faces for s in mine]
         )
+        normals = np.concatenate([s.normals for s in mine])
+        found[name] = Solid(vertices, faces, normals, link, mine[0].finger)
     return found
 
 
