@@ -10,13 +10,12 @@ import torch
 
 from torchgrasp.app.report import canvas as paint
 from torchgrasp.app.report.canvas import Direction
+from torchgrasp.app.report.closing_pictures import draw_ticks, finite_ticks
 from torchgrasp.app.report.run_data import explain_loss, first_touches, mass_centre, moments_of
-from torchgrasp.app.report.solids import solids_from_hand
-from torchgrasp.app.report.stills import add_solids, to_array
+from torchgrasp.app.report.stills import to_array
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
-from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.geometry.frames import apply, real
+from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
@@ -45,7 +44,6 @@ class FilmLayout:
     right: float = 0.985  # right end of the plots, as a share of the width
     letter_rise: int = 30  # height of a letter above the first plot [points]
     touch: int = 12  # size of the mark at a finger's first touch [points]
-    far: float = 0.25  # an object this far from its first place [m] is lost, and is not framed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +102,12 @@ def draw_film(
     height = FILM.still + sum(heights) + FILM.plot_gap * len(plots) + FILM.bottom
     size = FILM.width / FILM.dpi, height / FILM.dpi
     figure = Figure(size, dpi=FILM.dpi, facecolor=paint.PAPER)
-    stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction, edge)
+    # of a simulation that diverged, the last state before
+    finite = finite_ticks(closure)
+    ticks = [int(finite[finite <= moment.tick][-1]) for moment in moments]
+    table = dataclasses.replace(Plane.horizontal(0.0), edge=edge)
+    still_size = FILM.width // count, FILM.still - FILM.title
+    stills = draw_ticks(mesh, hand, closure, ticks, range(count), direction, table, still_size)
     font = FILM.font if count < FILM.many else FILM.small_font
     bottom = 1 - FILM.still / height
     shown = (FILM.still - FILM.title) / height
@@ -167,43 +170,6 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
     again = f" The hand closed {times(attempts)}." if attempts > 1 else ""
     end = (lost or "The object was held.") + on_its_way + again
     return f"In the order of touch: {order}. {end}"
-
-
-def _draw_stills(
-    mesh: "trimesh.Trimesh",
-    hand: Hand,
-    closure: ClosureResult,
-    ticks: list[int],
-    direction: Direction,
-    edge: Plane | None,
-) -> list[np.ndarray]:
-    """Return pictures of the hand and the object at the given ticks, all at the same scale."""
-    known = closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1)
-    finite = flatnonzero(known)
-    # of a simulation that diverged, the last state before
-    at = torch.stack([finite[finite <= tick][-1] for tick in ticks])
-    vertices = real(np.array(mesh.vertices))
-    faces = np.asarray(mesh.faces)
-    places = to_array(apply(closure.object_pose[at].double(), vertices))
-    hands = [
-        solids_from_hand(hand, closure.joints[t], closure.joint_names, closure.hand_pose[t])
-        for t in at
-    ]
-    height = float(apply(closure.object_pose[0].double(), vertices)[:, 2].min())
-    table = dataclasses.replace(Plane.horizontal(height), edge=edge)
-    near = [x for x in places if np.abs(x - places[0]).mean(0).max() < FILM.far]
-    seen = np.concatenate([*near, *(s.vertices for solids in hands for s in solids)])
-    size = FILM.width // len(ticks), FILM.still - FILM.title
-    # one camera for all pictures: the lift is seen
-    camera = paint.frame_camera(seen, direction, size=size)
-    pictures = []
-    for place, solids in zip(places, hands, strict=True):
-        canvas = paint.Canvas()
-        canvas.add_table(seen, table, [(place, faces), *((s.vertices, s.faces) for s in solids)])
-        canvas.add_mesh(place, faces, paint.OBJECT)
-        add_solids(canvas, solids)
-        pictures.append(canvas.render(camera, size))
-    return pictures
 
 
 def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[Any]) -> None:

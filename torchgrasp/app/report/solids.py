@@ -120,10 +120,16 @@ def solids_from_hand(
     order. `obj_from_hand` is the hand's pose [m].
     """
     poses = link_poses(hand, joints[None], names, obj_from_hand[None])[0].cpu().numpy()
+    return place_solids(hand, poses)
+
+
+def place_solids(hand: Hand, obj_from_link: Float[np.ndarray, "l 4 4"]) -> list[Solid]:
+    """Return a hand at the poses [m] of its l links as meshes in the object's frame [m]."""
     placed = []
     for solid in solids_of_links(hand):
-        turn = poses[solid.link, :3, :3].T
-        vertices = solid.vertices @ turn + poses[solid.link, :3, 3]
+        pose = obj_from_link[solid.link]
+        turn = pose[:3, :3].T
+        vertices = solid.vertices @ turn + pose[:3, 3]
         placed.append(solid._replace(vertices=vertices, normals=solid.normals @ turn))
     return placed
 
