@@ -391,7 +391,7 @@ def test_a_plan_says_from_where_to_look_next_unless_a_grasp_is_likely_enough(tmp
     tool = make_tool("plan_grasps_from_point_cloud", given)
     found = {}
     for enough in (0.0, 1.0):
-        monkeypatch.setattr("torchgrasp.app.cli.grasp.ENOUGH", enough)
+        monkeypatch.setattr("torchgrasp.app.cli.results.ENOUGH", enough)
         found[enough] = tool.run(Workplace.at(tmp_path)).look_next
     look = found[1.0]
     assert found[0.0] is None

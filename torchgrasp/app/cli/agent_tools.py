@@ -22,7 +22,7 @@ from torchgrasp.app.cli.clouds import CloudCheck
 from torchgrasp.app.cli.command import naming, option, required
 from torchgrasp.app.cli.depth_images import CloudScene
 from torchgrasp.app.cli.doctor import SIMULATORS
-from torchgrasp.app.cli.grasp import ENOUGH, Grasp, describe_look, find_look, read_true_mesh
+from torchgrasp.app.cli.grasp import Grasp
 from torchgrasp.app.cli.hands import TRIAL, describe, find_warnings, list_faults
 from torchgrasp.app.cli.inputs import (
     CLOUD_HELP,
@@ -38,18 +38,27 @@ from torchgrasp.app.cli.inputs import (
     read_distribution,
     read_table,
 )
-from torchgrasp.app.report.page import write_report
-from torchgrasp.app.report.run_data import Run, verdict
+from torchgrasp.app.cli.results import (
+    ENOUGH,
+    GRASPS,
+    REPORT,
+    SURFACE,
+    describe_look,
+    make_run,
+    read_true_mesh,
+    table_under,
+    write_run,
+)
+from torchgrasp.app.report.run_data import verdict
 from torchgrasp.app.report.stills import draw_grasp, facing, rotated
-from torchgrasp.app.report.viewer import VIEW, write_viewer
+from torchgrasp.app.report.viewer import VIEW
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.contacts.region import Region
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.data.shipped import list_objects
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.export import format_grasps, save_surface
-from torchgrasp.export.play import stand
+from torchgrasp.export import format_grasps
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, GraspError, Status
@@ -71,18 +80,14 @@ from torchgrasp.scene.file import read_scene, save_scene
 from torchgrasp.scene.image import is_scene
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.second_view import NextView
-from torchgrasp.shape.surface import Surface, extract_surface
-from torchgrasp.success.reasons import explain_success
+from torchgrasp.shape.surface import Surface
 from torchgrasp.success.task import GraspTask
 from torchgrasp.testing import check_hand
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps, PointCloud, format_success
 from torchgrasp.values.specs import FRICTIONS, MASSES, ContactSpec, Simulator, TrialSpec
 
-GRASPS = "grasps.safetensors"
-JSON = "grasps.json"
-SURFACE = "surface.ply"
-"""Names of the files that planning writes into its folder."""
+JSON = "grasps.json"  # file beside the others that planning writes into its folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -429,7 +434,7 @@ class _PlanTool(_HandTool):
             **self.task(),
             observer=lambda stage, _, value: told.update({stage: value}),
         )
-        return self.write(place, seen, out, name, hand_of(grasps, hand), grasps, told)
+        return self.write(place, seen, out, name, hand, grasps, told)
 
     def write(
         self,
@@ -445,40 +450,30 @@ class _PlanTool(_HandTool):
         scene = seen.source if isinstance(seen.source, Scene) else None
         cloud = take_target(scene, self.seed) if scene is not None else seen.source
         assert isinstance(cloud, PointCloud)
-        good = grasps[grasps.status == Status.OK]
-        costs = [
-            cost.sentence
-            for best in good[:1]
-            for cost in explain_success(best, hand, told["shape"], self.grasp_task)
-        ]
         spec = ContactSpec(friction=self.law, table=seen.table)
-        surface = extract_surface(told["shape"])
-        look = find_look(told["shape"], grasps, spec)
-        run = Run(name, seen.path, cloud, hand, spec, surface, grasps, plan=told.get("plan"))
-        run = dataclasses.replace(run, scene=scene, costs=tuple(costs), look=look)
-        grasps.save(out / GRASPS)
+        given = (name, seen.path, cloud, hand, spec, grasps, told["shape"], self.grasp_task)
+        run = make_run(*given, plan=told.get("plan"), scene=scene)
+        write_run(out, run, self.pages)
         files = dict[str, Any](grasps_file=place.tell(out / GRASPS))
+        good = run.executable
         rows = list[GraspRow]()
         if len(good):
-            content = format_grasps(hand, good[: self.most])
+            content = format_grasps(run.hand, good[: self.most])
             rows = [_row(row, good) for row in json.loads(content)["grasps"]]
             write_file(out / JSON, content)
-            save_surface(stand(surface, grasps.table), out / SURFACE)
             files["json_file"] = place.tell(out / JSON)
             files["surface_file"] = place.tell(out / SURFACE)
         if self.pages:
-            report = write_report(out / "report.html", run, VIEW)
-            viewer = write_viewer(out / VIEW, run)
-            files["pages"] = (place.tell(report), place.tell(viewer))
+            files["pages"] = (place.tell(out / REPORT), place.tell(out / VIEW))
         return PlanAnswer(
             verdict=verdict(run),
-            hand=hand.name,
-            fingers=hand.finger_names,
+            hand=run.hand.name,
+            fingers=run.hand.finger_names,
             executable=len(good),
             planned=len(grasps),
             grasps=tuple(rows),
             lowers_success=run.costs,
-            look_next=None if look is None else _look_row(look),
+            look_next=None if run.look is None else _look_row(run.look),
             notes=seen.notes,
             **files,
         )
@@ -635,7 +630,6 @@ class PlanFromDepth(_PlanTool):
         notes = dict.fromkeys((*seen.notes, *chosen.advice))
         seen = dataclasses.replace(seen, source=chosen, notes=tuple(notes))
         told = {"shape": best.shape}
-        hand = hand_of(best.grasps, hand)
         name = f"object {best.label}"
         answer = self.write(place, seen, out, name, hand, best.grasps, told)
         return dataclasses.replace(answer, objects=rows)
@@ -859,10 +853,7 @@ class CloseInSimulation(_GraspTool):
             hold_time=self.hold_time,
             simulator=self.simulator,
         )
-        plane = grasp.table
-        if plane is not None:  # the plan may have guessed its height, which the true mesh tells
-            lowest = float((mesh.vertices @ plane.normal.numpy()).min())
-            plane = dataclasses.replace(plane, offset=lowest)
+        plane = table_under(mesh, grasp.table)
         field = None
         if felt.is_file():
             surface = _read_surface(felt)

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, load_fingers
+from torchgrasp.app.cli.results import SURFACE
 from torchgrasp.app.report.glb import write_glb
 from torchgrasp.cloud.agreement import check_contacts, check_seen
 from torchgrasp.cloud.read import read_cloud
@@ -135,7 +136,7 @@ class Export(Command):
 
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return the exit code."""
-        surface = self.grasps.with_name("surface.ply")
+        surface = self.grasps.with_name(SURFACE)
         replaced = (self._plays or self.format == "glb") and surface.is_file()
         if self._needs_object and self.object is None and not replaced:
             raise BadArgument("--object", None, f"a path with --format {self.format}")

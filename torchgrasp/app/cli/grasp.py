@@ -3,7 +3,6 @@
 import dataclasses
 import datetime
 import functools
-import json
 import math
 from pathlib import Path
 from typing import Any, Literal
@@ -23,31 +22,33 @@ from torchgrasp.app.cli.command import (
     positional,
 )
 from torchgrasp.app.cli.live import shoot_scene
-from torchgrasp.app.report.page import grasp_columns, grasp_rows, write_report
+from torchgrasp.app.cli.results import (
+    ENOUGH,
+    describe_run,
+    make_run,
+    read_true_mesh,
+    table_under,
+    write_run,
+)
+from torchgrasp.app.report.page import grasp_columns, grasp_rows
 from torchgrasp.app.report.recording import import_rerun, write_recording
 from torchgrasp.app.report.run_data import Run, verdict
-from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.pose import find_plausible
-from torchgrasp.data.shipped import DATA, find_view, list_objects, load_object
+from torchgrasp.data.shipped import find_view
 from torchgrasp.evaluation.drag_trial import lift_from_edge
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.export import save_surface
-from torchgrasp.export.play import stand
-from torchgrasp.files import format_columns, format_line, sha256
+from torchgrasp.files import format_columns, format_line
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Count, Seed
 from torchgrasp.geometry.frames import rigid
 from torchgrasp.geometry.linalg import norm
-from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane, as_plane, move
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.clearing import order_to_clear
 from torchgrasp.planner.drag_plan import DragPlan
-from torchgrasp.planner.drag_text import KEY
 from torchgrasp.planner.edge import EdgePlan, plan_edge_grasps
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.graspable import judge_things
@@ -59,9 +60,6 @@ from torchgrasp.scene.image import is_scene, read_arrays
 from torchgrasp.scene.masks import label_again
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.second_view import NextView, next_view
-from torchgrasp.shape.surface import extract_surface
-from torchgrasp.success.reasons import explain_success
 from torchgrasp.success.task import GraspTask, TaskName
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps, PointCloud, format_success
@@ -71,8 +69,6 @@ Among = Literal["auto"] | None
 STAGES = ("shape", "plan", "certify", "query", "refine")
 """Stages of planning, as the planner reports them."""
 LEAST_BUDGET = 1e-3  # of --time-budget [s]
-ENOUGH = 0.9  # predicted success of an object that is easy enough: the others are not tried
-HELPS = 0.8  # share of the deviation that may remain after a second view that is worth telling
 DIGITS = 3  # decimals of a direction that is printed
 SHOWN = 5  # grasps that are printed
 OBJECT_WIDTHS = (-10, 7, -1)  # of the columns of a scene's objects
@@ -257,10 +253,8 @@ class Grasp(ForPrograms):
         inputs.print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
             check_mesh(cloud, true_mesh, "--mesh")
-            # the robot guesses the height of the table, which the true mesh tells
-            if plane is not None and view.table is None:
-                lowest = float((true_mesh.vertices @ plane.normal.numpy()).min())
-                plane = dataclasses.replace(plane, offset=lowest)
+            if view.table is None:
+                plane = table_under(true_mesh, plane)
             elif plane is not None:
                 check_stand(true_mesh, plane, "--mesh")
         progress = StageProgress(
@@ -397,27 +391,20 @@ class Grasp(ForPrograms):
         explanation: Explanation | None,
         scene: Scene | None = None,
     ) -> Run:
-        """Return the run, with what lowers the success of its best executable grasp most."""
-        hand = hand_of(grasps, hand)
-        costs = [
-            cost.sentence
-            for best in grasps[grasps.status == Status.OK][:1]
-            for cost in explain_success(best, hand, shape, self._task["task"])
-        ]
-        return Run(
+        """Return the run of a plan, whose shape and contacts `progress` holds."""
+        return make_run(
             name,
             path,
             cloud,
             hand,
             spec,
-            extract_surface(shape),
             grasps,
-            tuple(progress.stages),
-            progress.values.get("plan"),
+            shape,
+            self._task["task"],
+            stages=tuple(progress.stages),
+            plan=progress.values.get("plan"),
             scene=scene,
             explanation=explanation,
-            costs=tuple(costs),
-            look=find_look(shape, grasps, spec),
             command=command_line(),
             date=datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         )
@@ -572,12 +559,7 @@ class Grasp(ForPrograms):
         """Write grasps and estimated surface of a run, its HTML pages unless --no-report, and its
         recording.
         """
-        paths = [out / "grasps.safetensors"]
-        run.grasps.save(paths[0])
-        if len(run.executable):
-            paths.append(save_surface(stand(run.surface, run.grasps.table), out / "surface.ply"))
-        if not self.no_report:
-            paths += [write_report(out / "report.html", run, VIEW), write_viewer(out / VIEW, run)]
+        paths = write_run(out, run, pages=not self.no_report)
         if self.rerun:
             paths.append(write_recording(out / "run.rrd", run))
         return ", ".join(map(str, paths))
@@ -651,68 +633,3 @@ def describe_drag(drag: DragPlan, hand: Hand) -> str:
         f"{fingers} press on the object from above with {drag.force:.1f} N, "
         f"and drag it {1e3 * length:.0f} mm along ({along})"
     )
-
-
-def find_look(shape: ShapeGP, grasps: Grasps, spec: ContactSpec) -> NextView | None:
-    """Return from where a second view would help.
-
-    It is None if the best grasp is likely enough, or if no view would tell much.
-    """
-    best = grasps[grasps.status == Status.OK][:1]
-    if len(best) and float(best.success[0]) >= ENOUGH:
-        return None
-    view = next_view(shape, grasps, table=spec.plane)
-    return view if view.after < HELPS * view.before else None
-
-
-def describe_run(run: Run, out: Path) -> dict[str, Any]:
-    """Return the result of a run for JSON, with units in the names.
-
-    `best` is the best executable grasp, or None; `file`, in the folder `out`, holds all grasps.
-    """
-    best = None
-    for grasp in run.executable[:1]:
-        joints = run.hand.expand(grasp.joints[0])
-        best = {
-            "success": float(grasp.success[0]),
-            "joints_rad": {name: float(q) for name, q in joints.items()},
-            "obj_from_hand_m": grasp.obj_from_hand[0].tolist(),
-            "fingers": list(run.hand.finger_names),
-            "contacts_m": grasp.contacts.points[0].tolist(),
-        }
-    return {
-        "object": run.object_name,
-        "hand": run.hand.name,
-        "grasps": len(run.grasps),
-        "executable": len(run.executable),
-        "held": None if run.closure is None else run.closure.held,
-        "verdict": verdict(run),
-        "best": best,
-        "drag": json.loads(run.grasps.meta.get(KEY, "null")),
-        "look_next": None if run.look is None else describe_look(run.look),
-        "file": str(out / "grasps.safetensors"),
-    }
-
-
-def describe_look(view: NextView) -> dict[str, Any]:
-    """Return a camera for a second view for JSON, with units in the names."""
-    return {
-        "obj_from_camera_m": view.camera_pose.tolist(),
-        "turn_deg": view.turn if view.turn == view.turn else None,
-        "std_before_m": view.before,
-        "std_after_m": view.after,
-    }
-
-
-def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
-    """Return the closed mesh [m] of --mesh and, for a shipped object, its convex parts.
-
-    The parts are None for any other mesh.
-    """
-    with naming(path="--mesh", mesh="--mesh"):
-        mesh = read_mesh(path)
-        digest = sha256(path)
-    for name in list_objects():
-        if sha256(DATA / name / "mesh.ply") == digest:
-            return mesh, load_object(name).parts
-    return mesh, None
