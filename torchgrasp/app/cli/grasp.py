@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 import functools
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -59,7 +60,6 @@ from torchgrasp.scene.file import scene_of
 from torchgrasp.scene.image import is_scene, read_arrays
 from torchgrasp.scene.masks import label_again
 from torchgrasp.scene.scene import Scene
-from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.task import GraspTask, TaskName
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps, PointCloud, format_success
@@ -242,13 +242,12 @@ class Grasp(ForPrograms):
         file = inputs.without_exact_table(file, self.view.vertical)
         view = self.view.with_table_of(file)
         cloud = file.cloud
-        table = view.plane(file.cloud)
+        table = view.plane(cloud)
         if self.edge is not None:
             table = inputs.with_edge(table, self.edge)
         plane = as_plane(table)
-        spec = (ContactSpec.paper if self.mode == "paper" else ContactSpec)(
-            friction=self._friction, table=table
-        )
+        make_spec = ContactSpec.paper if self.mode == "paper" else ContactSpec
+        spec = make_spec(friction=self._friction, table=table)
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
         inputs.print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
@@ -281,7 +280,18 @@ class Grasp(ForPrograms):
                 shape = edge.shape
                 progress.values["plan"] = None  # the contacts where the object stood
                 cloud = move(cloud, rigid(torch.eye(3), drag.displacement).to(cloud.points))
-            run = self._gather(name, path, cloud, hand, spec, grasps, shape, progress, explanation)
+            run = make_run(
+                name,
+                path,
+                cloud,
+                hand,
+                spec,
+                grasps,
+                shape,
+                self._task["task"],
+                explanation=explanation,
+                **self._recorded(progress),
+            )
             if self.close and true_mesh is not None and len(run.executable):
                 run = self._close(run, edge, true_mesh, parts, plane, progress)
             progress.end("report", self._write(out, run))
@@ -289,9 +299,8 @@ class Grasp(ForPrograms):
             print(f"\ndrag first  {describe_drag(drag, run.hand)}")
         executable = print_grasps(run)
         answer(describe_run(run, out))
-        return (
-            0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
-        )
+        good = run.closure is not None and run.closure.held if self.close else executable
+        return 0 if good else 1
 
     def _plan(
         self,
@@ -378,36 +387,15 @@ class Grasp(ForPrograms):
         stages = tuple(progress.stages)
         return dataclasses.replace(run, stages=stages, mesh=mesh, closure=closure)
 
-    def _gather(
-        self,
-        name: str,
-        path: Path,
-        cloud: PointCloud,
-        hand: Hand,
-        spec: ContactSpec,
-        grasps: Grasps,
-        shape: ShapeGP,
-        progress: StageProgress,
-        explanation: Explanation | None,
-        scene: Scene | None = None,
-    ) -> Run:
-        """Return the run of a plan, whose shape and contacts `progress` holds."""
-        return make_run(
-            name,
-            path,
-            cloud,
-            hand,
-            spec,
-            grasps,
-            shape,
-            self._task["task"],
-            stages=tuple(progress.stages),
-            plan=progress.values.get("plan"),
-            scene=scene,
-            explanation=explanation,
-            command=command_line(),
-            date=datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
-        )
+    def _recorded(self, progress: StageProgress) -> dict[str, Any]:
+        """Return what `Run` holds of the course of the command."""
+        now = datetime.datetime.now(datetime.timezone.utc)
+        return {
+            "stages": tuple(progress.stages),
+            "plan": progress.values.get("plan"),
+            "command": command_line(),
+            "date": now.strftime("%Y-%m-%d %H:%M UTC"),
+        }
 
     @functools.cached_property
     def _friction(self) -> float | Distribution:
@@ -449,24 +437,7 @@ class Grasp(ForPrograms):
         return the exit code.
         """
         spec = ContactSpec(friction=self._friction)
-        choice = self.point if self.label is None else self.label
-        names = {
-            name: f"CLOUD: {name}"
-            for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")
-        }
-        names |= {"path": "CLOUD", "points": "CLOUD", "target": "--label", "point": "--point"}
-        options = {"table": "--table", "up": "--up"}
-        with naming(**names):
-            arrays = read_arrays(path)
-        found = "table" in arrays
-        with naming(**names if found else names | options):
-            # a table that is given is not searched first
-            scene = scene_of(arrays, self.view.given_table, self.view.vertical)
-        with naming(**options, target="--label", point="--point"):
-            # the shot of a live camera is on the table of the options
-            if found and not self.realsense:
-                scene = self._with_table(scene, choice is not None)
-            scene = scene if choice is None else scene.select(choice)
+        scene = self._read_scene(path)
         progress = StageProgress("scene", *["fingers"] * (among is not None), *STAGES, "report")
         with progress.bar, inputs.holding("--out", out):
             progress.end(
@@ -496,26 +467,54 @@ class Grasp(ForPrograms):
             spec = dataclasses.replace(spec, table=scene.table)
             cloud = take_target(scene, self.seed)
             name = f"object {scene.target}"
-            run = self._gather(
-                name, path, cloud, hand, spec, grasps, shape, progress, explanation, scene
+            run = make_run(
+                name,
+                path,
+                cloud,
+                hand,
+                spec,
+                grasps,
+                shape,
+                self._task["task"],
+                explanation=explanation,
+                scene=scene,
+                **self._recorded(progress),
             )
             progress.end("report", self._write(out, run))
             clear = ()
-            words = ""
             if explanation is not None:
                 options = {"fingers": among, "mode": self.mode, **self._task}
                 plan = functools.partial(
                     plan_grasps, hand=hand, spec=spec, seed=self.seed, **options
                 )
                 clear = order_to_clear(scene, plan, self.starts)
-                words = ", then ".join(f"object {label}" for label in clear)
-                progress.end("clear", words or "no object that is in the way")
+                progress.end("clear", name_in_order(clear) or "no object that is in the way")
         executable = print_grasps(run)
         if clear:
-            print(f"take away first  {words}; object {scene.target} then has a grasp")
+            first = name_in_order(clear)
+            print(f"take away first  {first}; object {scene.target} then has a grasp")
         of_scene = {"label": scene.target, "clear": list(clear), "doubts": list(scene.doubts)}
         answer(describe_run(run, out) | of_scene)
         return 0 if executable else 1
+
+    def _read_scene(self, path: Path) -> Scene:
+        """Return the scene of a file with the table of --table or --up, and the chosen target."""
+        choice = self.point if self.label is None else self.label
+        arrays_of_scene = ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")
+        names = {name: f"CLOUD: {name}" for name in arrays_of_scene}
+        names |= {"path": "CLOUD", "points": "CLOUD", "target": "--label", "point": "--point"}
+        options = {"table": "--table", "up": "--up"}
+        with naming(**names):
+            arrays = read_arrays(path)
+        found = "table" in arrays
+        with naming(**names if found else names | options):
+            # a table that is given is not searched first
+            scene = scene_of(arrays, self.view.given_table, self.view.vertical)
+        with naming(**options, target="--label", point="--point"):
+            # the shot of a live camera is on the table of the options
+            if found and not self.realsense:
+                scene = self._with_table(scene, choice is not None)
+            return scene if choice is None else scene.select(choice)
 
     def _with_table(self, scene: Scene, chosen: bool) -> Scene:
         """Return the scene with the table of --table or --up; raise `BadArgument` if the target is
@@ -603,6 +602,11 @@ def print_grasps(run: Run) -> bool:
         print(f"look next  from {run.look.sentence}")
     print(verdict(run))
     return len(run.executable) > 0
+
+
+def name_in_order(labels: Sequence[int]) -> str:
+    """Return the names of objects of a scene in the order in which they are taken away."""
+    return ", then ".join(f"object {label}" for label in labels)
 
 
 def rank_best(grasps: Grasps) -> float:
