@@ -15,15 +15,13 @@ import numpy as np
 import torch
 
 from torchgrasp import __version__
-from torchgrasp.app.author.fit_shapes import shape_points
-from torchgrasp.app.author.unusual import find_unusual
 from torchgrasp.app.cli.agent_files import Workplace, list_hands
 from torchgrasp.app.cli.clouds import CloudCheck
 from torchgrasp.app.cli.command import naming, option, required
 from torchgrasp.app.cli.depth_images import CloudScene
 from torchgrasp.app.cli.doctor import SIMULATORS
 from torchgrasp.app.cli.grasp import Grasp
-from torchgrasp.app.cli.hands import TRIAL, describe, find_warnings, list_faults
+from torchgrasp.app.cli.hands import TRIAL, describe, find_warnings, list_faults, list_unusual
 from torchgrasp.app.cli.inputs import (
     CLOUD_HELP,
     HAND_HELP,
@@ -70,7 +68,6 @@ from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surfac
 from torchgrasp.hand.abilities import hand_abilities, random_joints
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
-from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.objects import take_target
@@ -782,8 +779,6 @@ class CheckHand(Tool):
         except GraspError as error:  # a law of kinematics that the hand breaks
             return HandAnswer(sound=False, faults=(str(error),))
         joints = random_joints(hand, TRIAL.postures)
-        urdf = read_urdf(hand.urdf_path)
-        unusual = find_unusual(urdf, shape_points(urdf, urdf.path.parent))
         return HandAnswer(
             sound=True,
             faults=(),
@@ -791,7 +786,7 @@ class CheckHand(Tool):
             joints=hand.joint_names,
             description=describe(hand, joints),
             abilities=hand_abilities(hand, TRIAL.postures).content(),
-            notes=(*unusual, *find_warnings(hand, joints)),
+            notes=(*list_unusual(hand), *find_warnings(hand, joints)),
         )
 
 
