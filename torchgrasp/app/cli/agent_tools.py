@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from torchgrasp import __version__
-from torchgrasp.app.cli.agent_files import Workplace, list_hands
+from torchgrasp.app.cli.agent_files import Workplace
 from torchgrasp.app.cli.clouds import CloudCheck
 from torchgrasp.app.cli.command import naming, option, required
 from torchgrasp.app.cli.depth_images import CloudScene
@@ -67,7 +67,7 @@ from torchgrasp.geometry.plane import Plane, as_plane, move, upright_frame, upri
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.abilities import hand_abilities, random_joints
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.load import hand_of
+from torchgrasp.hand.load import hand_of, list_hands
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.objects import take_target
