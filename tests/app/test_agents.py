@@ -25,16 +25,9 @@ from scipy.spatial.transform import Rotation
 from tests.make import halved
 from torchgrasp import Distribution, GraspTask, load_grasps, load_object, load_scene
 from torchgrasp.app.cli import agent_server
+from torchgrasp.app.cli.agent_answers import Answer, ChangeRow, ExplainAnswer, plain_answer
 from torchgrasp.app.cli.agent_files import Workplace
-from torchgrasp.app.cli.agent_tools import (
-    TOOLS,
-    Answer,
-    ChangeRow,
-    ExplainAnswer,
-    Tool,
-    make_tool,
-    plain_answer,
-)
+from torchgrasp.app.cli.agent_tools import TOOLS, Tool, make_tool
 from torchgrasp.data.shipped import DATA, load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument, GraspError
 from torchgrasp.hand.load import hands_folder
