@@ -195,6 +195,18 @@ class _Seen:
     table: Plane | float | None
     notes: tuple[str, ...] = ()
 
+    @classmethod
+    def in_scene(cls, path: Path, scene: Scene) -> "_Seen":
+        """Return what is seen in the scene of a file."""
+        return cls(path, scene, scene.table, (*scene.notes, *scene.advice))
+
+    @property
+    def name(self) -> str:
+        """The name of the object that is grasped."""
+        if isinstance(self.source, Scene):
+            return f"object {self.source.target}"
+        return object_name(self.path)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _HandTool(Tool):
@@ -248,7 +260,7 @@ class _PlanTool(_HandTool):
         None, "folder to write below the server's folder; by default out/ and the object's name"
     )
 
-    def plan(self, place: Workplace, seen: _Seen, out: Path, name: str) -> PlanAnswer:
+    def plan(self, place: Workplace, seen: _Seen, out: Path) -> PlanAnswer:
         """Plan grasps of what is seen, write them into a folder, and return the answer."""
         hand, among = self.load(place)
         spec = ContactSpec(friction=self.law, table=seen.table)
@@ -263,24 +275,26 @@ class _PlanTool(_HandTool):
             **self.task(),
             observer=lambda stage, _, value: told.update({stage: value}),
         )
-        return self.write(place, seen, out, name, hand, grasps, told)
+        return self.write(place, seen, out, hand, grasps, told)
 
     def write(
         self,
         place: Workplace,
         seen: _Seen,
         out: Path,
-        name: str,
         hand: Hand,
         grasps: Grasps,
         told: dict[str, Any],
     ) -> PlanAnswer:
-        """Write grasps with the surface and pages of their plan; return the answer."""
+        """Write grasps with the surface and pages of their plan; return the answer.
+
+        `told` holds the estimated "shape" and, if it is known, the "plan" of contacts.
+        """
         scene = seen.source if isinstance(seen.source, Scene) else None
         cloud = take_target(scene, self.seed) if scene is not None else seen.source
         assert isinstance(cloud, PointCloud)
         spec = ContactSpec(friction=self.law, table=seen.table)
-        given = (name, seen.path, cloud, hand, spec, grasps, told["shape"], self.grasp_task)
+        given = (seen.name, seen.path, cloud, hand, spec, grasps, told["shape"], self.grasp_task)
         run = make_run(*given, plan=told.get("plan"), scene=scene)
         write_run(out, run, self.pages)
         files = dict[str, Any](grasps_file=place.tell(out / GRASPS))
@@ -346,7 +360,7 @@ class PlanFromCloud(_PlanTool, _SeenTool):
         seen = self.see(place, path)
         check_folder(out)
         with holding("out", out):
-            answer = self.plan(place, seen, out, object_name(path))
+            answer = self.plan(place, seen, out)
         return dataclasses.replace(answer, seen_file=self.cloud)
 
 
@@ -385,12 +399,12 @@ class PlanFromDepth(_PlanTool):
         out = place.out(self.out, path)
         scene = self.see(place, path)
         check_folder(out)
-        seen = _Seen(path, scene, scene.table, (*scene.notes, *scene.advice))
+        seen = _Seen.in_scene(path, scene)
         file = out / "scene.npz"
         with holding("out", out):
             if scene.target is not None:
                 save_scene(scene, file)
-                answer = self.plan(place, seen, out, f"object {scene.target}")
+                answer = self.plan(place, seen, out)
             else:
                 answer = self.choose(place, seen, scene, out, file)
         return dataclasses.replace(answer, seen_file=place.tell(file))
@@ -459,8 +473,7 @@ class PlanFromDepth(_PlanTool):
         notes = dict.fromkeys((*seen.notes, *chosen.advice))
         seen = dataclasses.replace(seen, source=chosen, notes=tuple(notes))
         told = {"shape": best.shape}
-        name = f"object {best.label}"
-        answer = self.write(place, seen, out, name, hand, best.grasps, told)
+        answer = self.write(place, seen, out, hand, best.grasps, told)
         return dataclasses.replace(answer, objects=rows)
 
 
@@ -496,7 +509,7 @@ class PlanFromMesh(_PlanTool):
         file = out / "view.npz"
         with holding("out", out):
             save_cloud(cloud, file, table)
-            answer = self.plan(place, _Seen(path, cloud, table), out, object_name(path))
+            answer = self.plan(place, _Seen(path, cloud, table), out)
         return dataclasses.replace(answer, seen_file=place.tell(file))
 
 
@@ -519,7 +532,7 @@ class ExplainEmpty(_HandTool, _SeenTool):
         if is_scene(path):
             scene = read_scene(path)
             scene = scene if self.label is None else scene.select(self.label)
-            seen = _Seen(path, scene, scene.table, (*scene.notes, *scene.advice))
+            seen = _Seen.in_scene(path, scene)
         elif self.label is not None:
             raise BadArgument("label", "a label beside a cloud", "a scene, which has labels")
         else:
