@@ -8,7 +8,7 @@ from jaxtyping import Int, UInt8
 from torch import Tensor
 
 from torchgrasp.app.report import canvas as paint
-from torchgrasp.app.report.canvas import Direction
+from torchgrasp.app.report.raster import Direction
 from torchgrasp.app.report.solids import link_poses, place_solids
 from torchgrasp.app.report.stills import add_solids, to_array
 from torchgrasp.foundation.base import flatnonzero

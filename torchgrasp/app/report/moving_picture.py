@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from torchgrasp.app.report.canvas import Direction
 from torchgrasp.app.report.closing_pictures import draw_ticks, finite_ticks
+from torchgrasp.app.report.raster import Direction
 from torchgrasp.app.report.stills import facing
 from torchgrasp.control.reference import check_single
 from torchgrasp.files import write_file

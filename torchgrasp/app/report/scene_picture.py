@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from torchgrasp.app.report.canvas import FULL, GRID, INK, OBJECTS, PAPER, encode_png, rgb
+from torchgrasp.app.report.canvas import GRID, INK, OBJECTS, PAPER, encode_png, rgb
+from torchgrasp.app.report.raster import FULL
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.lazy import Image, ImageDraw, ImageFont, ndimage

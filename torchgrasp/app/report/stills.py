@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.app.report import canvas as paint
-from torchgrasp.app.report.canvas import Direction
+from torchgrasp.app.report.raster import Direction
 from torchgrasp.app.report.solids import PARKED, Solid, finger_of_links, solids_from_hand
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import Image
