@@ -9,9 +9,14 @@ import numpy as np
 import torch
 
 from torchgrasp.app.report import canvas as paint
+from torchgrasp.app.report.closing_moments import (
+    explain_loss,
+    first_touches,
+    mass_centre,
+    moments_of,
+)
 from torchgrasp.app.report.closing_pictures import draw_ticks, finite_ticks
 from torchgrasp.app.report.raster import Direction
-from torchgrasp.app.report.run_data import explain_loss, first_touches, mass_centre, moments_of
 from torchgrasp.app.report.stills import to_array
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
 from torchgrasp.foundation.lazy import trimesh
