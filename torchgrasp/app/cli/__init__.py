@@ -37,7 +37,7 @@ CHAPTERS = {
     },
     "Exchange grasps with other programs": {
         "export": "export.Export",
-        "import": "export.Import",
+        "import": "importing.Import",
         "mcp": "agents.ServeAgents",
     },
     "Try many grasps in simulation": {
