@@ -143,6 +143,15 @@ def law_of(name: str, given: float | str) -> float | Distribution:
     return read_distribution(name, given) if isinstance(given, str) else given
 
 
+def region_of(name: str, box: Box | None) -> Region | None:
+    """Return the box [m] that the argument `name` gives as a region; None for None."""
+    if box is None:
+        return None
+    low, high = real(box).split(3)
+    with naming(low=name):
+        return Region.box(low, high)
+
+
 class Tool:
     """Base of all tools; the fields of a tool are its arguments."""
 
@@ -232,12 +241,12 @@ class _HandTool(Tool):
 
     def task(self) -> dict[str, Any]:
         """Return the options of the planner that say what the grasps must do, and where."""
-        regions = {}
-        for name, box in (("keep", self.keep), ("avoid", self.avoid)):
-            with naming(low=name):
-                low, high = real(box or [0.0] * 6).split(3)
-                regions[name] = None if box is None else Region.box(low, high)
-        return {"task": self.grasp_task, "promise": self.promise, **regions}
+        return {
+            "task": self.grasp_task,
+            "promise": self.promise,
+            "keep": region_of("keep", self.keep),
+            "avoid": region_of("avoid", self.avoid),
+        }
 
     @property
     def law(self) -> float | Distribution:

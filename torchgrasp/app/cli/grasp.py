@@ -60,6 +60,7 @@ from torchgrasp.scene.file import scene_of
 from torchgrasp.scene.image import is_scene, read_arrays
 from torchgrasp.scene.masks import label_again
 from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.task import GraspTask, TaskName
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps, PointCloud, format_success
@@ -565,9 +566,9 @@ class Grasp(ForPrograms):
 
     def _find_easiest(
         self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: StageProgress
-    ):
+    ) -> tuple[Scene, Grasps, ShapeGP] | None:
         """Plan for the objects of a scene until one is easy; return the scene with it as target,
-        grasps and shape.
+        grasps and shape, or None if no object has a grasp.
         """
         options = {"fingers": among, "enough": ENOUGH, **self._task}
         plan = plan_scene(scene, hand, spec, self.starts, self.seed, **options)
@@ -579,14 +580,12 @@ class Grasp(ForPrograms):
             likely = "-" if thing.grasps is None else format_success(thing.success)
             cells = f"object {thing.label}", likely, text
             print(format_line(cells, OBJECT_WIDTHS), flush=True)
-        progress.end(
-            "objects", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp"
-        )
+        graspable = sum(thing.grasps is not None for thing in plan.things)
+        progress.end("objects", f"{graspable} with a grasp")
         if plan.best is None or plan.best.grasps is None or plan.best.shape is None:
-            help = "With --label or --point, changes that would help are tried for one of them."
-            return print(
-                f"The {hand.name} hand has no executable grasp of any object in the scene.\n{help}"
-            )
+            print(f"The {hand.name} hand has no executable grasp of any object in the scene.")
+            print("With --label or --point, changes that would help are tried for one of them.")
+            return None
         return scene.select(plan.best.label), plan.best.grasps, plan.best.shape
 
 
