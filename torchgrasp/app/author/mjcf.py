@@ -36,15 +36,15 @@ class FromMjcf(NamedTuple):
 def read_mjcf(
     path: Path,
     folder: Path,
-    root: str = "",
-    tips: Sequence[str] = (),
-    visual: bool = False,
-    meshes: Path | None = None,
+    root: str,
+    tips: Sequence[str],
+    visual: bool,
+    meshes: Path | None,
 ) -> FromMjcf:
     """Return an MJCF as a URDF, whose meshes are written to `folder`.
 
-    All files of the MJCF lie below the folder `meshes`, by default its own. `root` names a body of
-    the hand, if the file has more. `tips` are sites or bodies that the user chose. With `visual`,
+    All files of the MJCF lie below the folder `meshes`; None means its own. `root` names a body of
+    the hand, if the file has more; "" if not. `tips` are sites or bodies that the user chose. With `visual`,
     bodies without collision geoms take their visual ones. Raises `HandFileError` for a file that is
     refused, and `MissingExtra` without MuJoCo.
     """

@@ -257,7 +257,7 @@ def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
     return names
 
 
-def print_score(score: ViewScore, widths: tuple[int, int] = NAME_WIDTHS) -> None:
+def print_score(score: ViewScore, widths: tuple[int, int]) -> None:
     """Print one line with the result of a view.
 
     `widths` are the widths [characters] of the columns with the names of object and view.

@@ -132,8 +132,15 @@ class HandNew(Command):
         # the published URDF is not overwritten
         taken = (folder / "hand.urdf").resolve() == urdf.resolve()
         clean = "hand_clean.urdf" if taken else "hand.urdf"
-        sensors = self.tip_offset, self.tip_radius
-        wish = Wish(self.tips, self.name or "", self.root, meshes, self.visual, *sensors)
+        wish = Wish(
+            tips=self.tips,
+            name=self.name or "",
+            root=self.root,
+            meshes=meshes,
+            visual=self.visual,
+            tip_offset=self.tip_offset,
+            tip_radius=self.tip_radius,
+        )
         draft = new_hand(urdf, wish, self.seed, clean)
         texts: dict[str, str | bytes] = {"hand.toml": draft.toml, **draft.meshes}
         if draft.urdf or out is not None:
