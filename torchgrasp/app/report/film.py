@@ -10,6 +10,7 @@ import torch
 
 from torchgrasp.app.report import canvas as paint
 from torchgrasp.app.report.closing_moments import (
+    Moment,
     explain_loss,
     first_touches,
     mass_centre,
@@ -101,27 +102,20 @@ def draw_film(
 
     moments = moments_of(closure, mass_centre(mesh), hand.tips.names)
     plots = _list_plots(mesh, hand, closure)
-    time = to_array(closure.time)
-    count = len(moments)
     heights = [FILM.tall_plot if title.endswith(":") else FILM.plot for title, *_ in plots]
     height = FILM.still + sum(heights) + FILM.plot_gap * len(plots) + FILM.bottom
     size = FILM.width / FILM.dpi, height / FILM.dpi
     figure = Figure(size, dpi=FILM.dpi, facecolor=paint.PAPER)
+
     # of a simulation that diverged, the last state before
     finite = finite_ticks(closure)
     ticks = [int(finite[finite <= moment.tick][-1]) for moment in moments]
     table = dataclasses.replace(Plane.horizontal(0.0), edge=edge)
+    count = len(moments)
     still_size = FILM.width // count, FILM.still - FILM.title
     stills = draw_ticks(mesh, hand, closure, ticks, range(count), direction, table, still_size)
-    font = FILM.font if count < FILM.many else FILM.small_font
-    bottom = 1 - FILM.still / height
-    shown = (FILM.still - FILM.title) / height
-    for k, (still, moment) in enumerate(zip(stills, moments, strict=True)):
-        axis = figure.add_axes((k / count, bottom, 1 / count, shown))
-        axis.imshow(still, aspect="auto")
-        axis.set_axis_off()
-        title = f"{LETTERS[k]}  {float(closure.time[moment.tick]):.2f} s  {moment.name}"
-        axis.set_title(title, loc="left", x=FILM.title_left, color=moment.color, fontsize=font)
+    times = [float(closure.time[moment.tick]) for moment in moments]
+    _add_stills(figure, height, list(stills), moments, times)
 
     figure.subplots_adjust(
         FILM.left,
@@ -131,6 +125,7 @@ def draw_film(
         hspace=FILM.plot_gap / float(np.mean(heights)),
     )
     axes = figure.subplots(len(plots), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    time = to_array(closure.time)
     for axis, plot in zip(axes, plots, strict=True):
         _draw_plot(axis, time, *plot)
     for finger, tick in zip(closure.contact_order, first_touches(closure), strict=True):
@@ -138,15 +133,44 @@ def draw_film(
         # in front of the axis, which is drawn in layer 2
         look = {"color": color, "markersize": FILM.touch, "clip_on": False, "zorder": 3}
         axes[0].plot(time[tick], 0.0, "^", **look)
-    for letter, moment in zip(LETTERS, moments, strict=False):
-        at = float(closure.time[moment.tick])
+    _mark_moments(axes, moments, times)
+    axes[-1].set_xlabel("time [s]", fontsize=PLOTS.font, color=paint.INK)
+    return paint.encode_figure(figure)
+
+
+def _add_stills(
+    figure: Any,
+    height: int,
+    stills: list[np.ndarray],
+    moments: list[Moment],
+    times: list[float],
+) -> None:
+    """Add stills with their titles in a row at the top of a figure of a height [pixels].
+
+    `times` [s] are those of the `moments`.
+    """
+    count = len(stills)
+    font = FILM.font if count < FILM.many else FILM.small_font
+    bottom = 1 - FILM.still / height
+    shown = (FILM.still - FILM.title) / height
+    for k, (still, moment, time) in enumerate(zip(stills, moments, times, strict=True)):
+        axis = figure.add_axes((k / count, bottom, 1 / count, shown))
+        axis.imshow(still, aspect="auto")
+        axis.set_axis_off()
+        title = f"{LETTERS[k]}  {time:.2f} s  {moment.name}"
+        axis.set_title(title, loc="left", x=FILM.title_left, color=moment.color, fontsize=font)
+
+
+def _mark_moments(axes: Any, moments: list[Moment], times: list[float]) -> None:
+    """Draw a line through all plots at the time [s] of each moment, with a letter above it."""
+    for letter, moment, time in zip(LETTERS, moments, times, strict=False):
         color = moment.color
         wide = 2 if color == paint.ALARM else 1
         for axis in axes:
-            axis.axvline(at, color=color, linewidth=wide, clip_on=False)
+            axis.axvline(time, color=color, linewidth=wide, clip_on=False)
         axes[0].annotate(
             letter,
-            (at, 1.0),
+            (time, 1.0),
             xycoords=axes[0].get_xaxis_transform(),
             xytext=(0, FILM.letter_rise),
             textcoords="offset points",
@@ -154,8 +178,6 @@ def draw_film(
             color=color,
             fontsize=FILM.font,
         )
-    axes[-1].set_xlabel("time [s]", fontsize=PLOTS.font, color=paint.INK)
-    return paint.encode_figure(figure)
 
 
 def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> str:
