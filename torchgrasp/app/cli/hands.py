@@ -49,8 +49,14 @@ from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.request import finger_sets
 from torchgrasp.posture_model.dataset import write_samples
-from torchgrasp.posture_model.mixture import mixture_path
-from torchgrasp.posture_model.sample import SampleSpec, Sampling, can_close, sample_configurations
+from torchgrasp.posture_model.mixture import GraspMixture, mixture_path
+from torchgrasp.posture_model.sample import (
+    HandSamples,
+    SampleSpec,
+    Sampling,
+    can_close,
+    sample_configurations,
+)
 from torchgrasp.posture_model.score import evaluate_mixture, growing_bic
 from torchgrasp.posture_model.training import FitProgress, fit_mixture
 from torchgrasp.testing import check_hand, find_faults, most_met
@@ -473,22 +479,7 @@ class HandTrain(Command):
             print(f"{hand.name}: {len(samples)} postures in {time.perf_counter() - begin:.0f} s")
             begin = time.perf_counter()
             components = self.components or choose_components(hand, self.seed, self.workers)
-            with make_bar(None, "step", desc="EM") as bar, naming(path="--checkpoint"):
-
-                def show(progress: FitProgress) -> None:
-                    bar.update()
-                    bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
-
-                mixture = fit_mixture(
-                    samples[: self.n],
-                    components,
-                    self.seed,
-                    tolerance=TRAIN.tolerance,
-                    starts=TRAIN.starts,
-                    subset=TRAIN.subset * components,
-                    checkpoint=self.checkpoint,
-                    observer=show,
-                )
+            mixture = self._fit(samples[: self.n], components)
             meta = mixture.meta
             spent = time.perf_counter() - begin
             print(
@@ -506,6 +497,25 @@ class HandTrain(Command):
                 dataclasses.replace(mixture, meta=meta | score.meta()).save(out)
             print(f"written: {out}")
         return 0
+
+    def _fit(self, samples: HandSamples, components: int) -> GraspMixture:
+        """Return a mixture of Gaussians that is fitted to samples of postures."""
+        with make_bar(None, "step", desc="EM") as bar, naming(path="--checkpoint"):
+
+            def show(progress: FitProgress) -> None:
+                bar.update()
+                bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
+
+            return fit_mixture(
+                samples,
+                components,
+                self.seed,
+                tolerance=TRAIN.tolerance,
+                starts=TRAIN.starts,
+                subset=TRAIN.subset * components,
+                checkpoint=self.checkpoint,
+                observer=show,
+            )
 
 
 def choose_components(hand: Hand, seed: int, workers: int) -> int:
