@@ -252,11 +252,7 @@ class Grasp(ForPrograms):
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
         inputs.print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
-            check_mesh(cloud, true_mesh, "--mesh")
-            if view.table is None:
-                plane = table_under(true_mesh, plane)
-            elif plane is not None:
-                check_stand(true_mesh, plane, "--mesh")
+            plane = check_truth(cloud, true_mesh, plane, given=view.table is not None)
         progress = StageProgress(
             *["fingers"] * (among is not None),
             *STAGES,
@@ -265,10 +261,7 @@ class Grasp(ForPrograms):
             "report",
         )
         with progress.bar, inputs.holding("--out", out):
-            origin = "no table" if table is None else inputs.describe_table(table)
-            origin += " (lowest point)" * (table is not None and view.table is None)
-            camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
-            progress.end("cloud", f"{len(cloud)} points, {camera}, {origin}")
+            progress.end("cloud", describe_seen(cloud, table, given=view.table is not None))
             grasps, explanation = self._plan(cloud, hand, spec, among, progress)
             name = inputs.object_name(path if mesh is None else mesh)
             shape = progress.values["shape"]
@@ -587,6 +580,30 @@ class Grasp(ForPrograms):
             print("With --label or --point, changes that would help are tried for one of them.")
             return None
         return scene.select(plan.best.label), plan.best.grasps, plan.best.shape
+
+
+def check_truth(
+    cloud: PointCloud, mesh: "trimesh.Trimesh", table: Plane | None, given: bool
+) -> Plane | None:
+    """Return the table under the true mesh [m], which is the `table` if that is `given`.
+
+    Raises `BadArgument` for a mesh that contradicts the cloud, or does not stand on a given table.
+    """
+    check_mesh(cloud, mesh, "--mesh")
+    if not given:
+        return table_under(mesh, table)
+    if table is not None:
+        check_stand(mesh, table, "--mesh")
+    return table
+
+
+def describe_seen(cloud: PointCloud, table: Plane | float | None, given: bool) -> str:
+    """Return a text on a cloud and its table, which is at the lowest point if it is not `given`."""
+    camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
+    place = "no table"
+    if table is not None:
+        place = f"{inputs.describe_table(table)}{'' if given else ' (lowest point)'}"
+    return f"{len(cloud)} points, {camera}, {place}"
 
 
 def print_grasps(run: Run) -> bool:
