@@ -33,6 +33,10 @@ class ModelHand:
     Attributes:
         bodies: indices of the bodies of the hand, parents first; a world body that is kept is 0.
         joints: indices of their joints of one coordinate, in the order of the bodies.
+        root: index of the body at the root of the hand; 0 for the world.
+        on_world: whether the fingers are fixed to the world, whose shapes are then the palm.
+        parents, names: the parent's index and the name of each body of the model.
+        owners, joint_names: the body's index and the name of each joint of the model.
         told, warnings: sentences for the user.
     """
 
