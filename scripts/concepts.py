@@ -25,7 +25,8 @@ from torchgrasp import (
     load_object,
     plan_edge_grasps,
 )
-from torchgrasp.app.report.canvas import OBJECT, Camera, Canvas, frame_camera
+from torchgrasp.app.report.canvas import OBJECT, Canvas, frame_camera
+from torchgrasp.app.report.raster import Camera
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import add_solids
 from torchgrasp.cloud import look_at, partial_view

@@ -22,7 +22,8 @@ from torchgrasp import (
     load_object,
     plan_grasps,
 )
-from torchgrasp.app.report.canvas import AXES, FINGERS, OBJECT, Canvas, Direction
+from torchgrasp.app.report.canvas import AXES, FINGERS, OBJECT, Canvas
+from torchgrasp.app.report.raster import Direction
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import facing
 from torchgrasp.geometry.frames import virtual_frame

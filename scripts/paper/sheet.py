@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from torchgrasp.app.report.canvas import INK, PAPER, Canvas, Direction, draw_bar, encode_png
+from torchgrasp.app.report.canvas import INK, PAPER, Canvas, draw_bar, encode_png
+from torchgrasp.app.report.raster import Direction
 from torchgrasp.files import write_file
 
 Tile = tuple[int, int]

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from paper.sheet import render_tile, save_sheet
 from torchgrasp import Hand, load_hand, load_mixture
-from torchgrasp.app.report.canvas import FINGERS, GRID, INK, PAPER, Canvas, Direction
+from torchgrasp.app.report.canvas import FINGERS, GRID, INK, PAPER, Canvas
+from torchgrasp.app.report.raster import Direction
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.files import write_file
 from torchgrasp.posture_model.mixture import encode_fingertips

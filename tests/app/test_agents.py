@@ -25,16 +25,9 @@ from scipy.spatial.transform import Rotation
 from tests.make import halved
 from torchgrasp import Distribution, GraspTask, load_grasps, load_object, load_scene
 from torchgrasp.app.cli import agent_server
+from torchgrasp.app.cli.agent_answers import Answer, ChangeRow, ExplainAnswer, plain_answer
 from torchgrasp.app.cli.agent_files import Workplace
-from torchgrasp.app.cli.agent_tools import (
-    TOOLS,
-    Answer,
-    ChangeRow,
-    ExplainAnswer,
-    Tool,
-    make_tool,
-    plain_answer,
-)
+from torchgrasp.app.cli.agent_tools import TOOLS, Tool, make_tool
 from torchgrasp.data.shipped import DATA, load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument, GraspError
 from torchgrasp.hand.load import hands_folder
@@ -391,7 +384,7 @@ def test_a_plan_says_from_where_to_look_next_unless_a_grasp_is_likely_enough(tmp
     tool = make_tool("plan_grasps_from_point_cloud", given)
     found = {}
     for enough in (0.0, 1.0):
-        monkeypatch.setattr("torchgrasp.app.cli.grasp.ENOUGH", enough)
+        monkeypatch.setattr("torchgrasp.app.cli.results.ENOUGH", enough)
         found[enough] = tool.run(Workplace.at(tmp_path)).look_next
     look = found[1.0]
     assert found[0.0] is None

@@ -16,6 +16,7 @@ from torchgrasp.app.cli import grasp as grasps
 from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.evaluate import print_score
 from torchgrasp.app.cli.inputs import check_folder
+from torchgrasp.app.cli.results import read_true_mesh
 from torchgrasp.data.shipped import DATA
 from torchgrasp.evaluation.summary import ViewScore
 from torchgrasp.foundation.errors import MissingExtra
@@ -263,11 +264,11 @@ def test_the_table_is_at_the_lowest_point_that_is_no_outlier_unless_it_is_given(
 def test_a_shipped_mesh_comes_with_its_parts_wherever_it_lies(tmp_path):
     copy = tmp_path / "copy.ply"
     copy.write_bytes((DATA / "jug" / "mesh.ply").read_bytes())
-    mesh, parts = grasps.read_true_mesh(copy)
+    mesh, parts = read_true_mesh(copy)
     assert parts is not None and len(parts) > 1
     assert sum(p.volume for p in parts) == pytest.approx(mesh.volume, rel=0.35)
     trimesh.creation.box((0.05, 0.05, 0.05)).export(tmp_path / "box.stl")
-    assert grasps.read_true_mesh(tmp_path / "box.stl")[1] is None
+    assert read_true_mesh(tmp_path / "box.stl")[1] is None
 
 
 def test_grasp_writes_grasps_and_pages_for_a_shipped_object_by_name(

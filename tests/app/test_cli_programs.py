@@ -21,7 +21,7 @@ QUICK = ("--starts", "8", "--no-report", "--hand", "barrett")
 
 
 def test_grasp_tells_its_result_as_json_and_its_words_on_stderr(run_command, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchgrasp.app.cli.grasp.ENOUGH", 1.0)  # no grasp is likely enough
+    monkeypatch.setattr("torchgrasp.app.cli.results.ENOUGH", 1.0)  # no grasp is likely enough
     code, out, err = run_command("grasp", "cylinder", *QUICK, "--out", tmp_path, "--json")
     told = json.loads(out)
     best = load_grasps(tmp_path / "grasps.safetensors").best

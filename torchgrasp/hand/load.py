@@ -29,6 +29,15 @@ def hands_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "hands"
 
 
+def list_hands() -> tuple[str, ...]:
+    """Return the names of the shipped hands, in alphabetical order.
+
+    >>> "allegro" in list_hands()
+    True
+    """
+    return tuple(sorted(path.parent.name for path in hands_folder().glob("*/hand.toml")))
+
+
 @checked
 def find_hand(name_or_path: str | Path) -> Path:
     """Return the folder of a hand.
@@ -44,7 +53,7 @@ def find_hand(name_or_path: str | Path) -> Path:
     'allegro'
     """
     shipped = hands_folder()
-    names = sorted(p.parent.name for p in shipped.glob("*/hand.toml"))
+    names = list(list_hands())
     if isinstance(name_or_path, str) and name_or_path in names:
         here = Path(name_or_path)
         if (here / "hand.toml").is_file() and here.resolve() != (shipped / name_or_path).resolve():

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from torchgrasp.foundation.errors import Status
-from torchgrasp.hand.load import hands_folder, load_hand
+from torchgrasp.hand.load import list_hands, load_hand
 from torchgrasp.planner.objects import take_target
 from torchgrasp.planner.request import Request, finger_sets
 from torchgrasp.scene.scene import Scene
@@ -129,7 +129,7 @@ def _hands(request: Request) -> Iterator[Change]:
     """
     if request.mode != "joint" or request.arm is not None:
         return
-    names = sorted(path.parent.name for path in hands_folder().glob("*/hand.toml"))
+    names = list_hands()
     for name in names:
         own = f"{request.hand.name}_".startswith(f"{name}_")
         variant = any(name.startswith(f"{k}_") for k in names)

@@ -7,7 +7,7 @@ import trimesh
 
 from torchgrasp.app.author import Wish, new_hand
 from torchgrasp.app.author.pads import Guess
-from torchgrasp.app.author.sensor_tips import add_seen_sensors, extend_pads
+from torchgrasp.app.author.sensor_tips import add_seen_sensors, extend_pads, find_sensors
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.hand_toml import Pad
@@ -107,7 +107,8 @@ def test_the_drawn_sensor_is_closed_however_thin_it_is():
     empty = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     for radius in (0.0005, 0.001, 0.02):
         (pad,) = extend_pads(["tip"], guess, (0.01,), (radius,), named=True)
-        vertices, faces = add_seen_sensors({"tip": empty}, ["tip"], guess, [pad])["tip"]
+        sensors = find_sensors(["tip"], guess, [pad])
+        vertices, faces = add_seen_sensors({"tip": empty}, sensors)["tip"]
         drawn = trimesh.Trimesh(vertices, faces, process=False)
         assert drawn.is_volume
         bounds = [-radius, -radius, 0.03 - 2 * radius], [radius, radius, 0.04]

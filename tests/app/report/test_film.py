@@ -11,9 +11,10 @@ import pytest
 import torch
 from PIL import Image
 
-from torchgrasp.app.report.canvas import ALARM, PAPER, SHADOW, Camera, Canvas, rgb
+from torchgrasp.app.report.canvas import ALARM, PAPER, SHADOW, Canvas, rgb
+from torchgrasp.app.report.closing_moments import explain_loss, find_loss, moments_of, moved_in_hand
 from torchgrasp.app.report.film import FILM, _list_plots, describe_film, draw_film
-from torchgrasp.app.report.run_data import explain_loss, find_loss, moments_of, moved_in_hand
+from torchgrasp.app.report.raster import Camera
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.plane import Plane

@@ -1,14 +1,8 @@
 import numpy as np
 import trimesh
 
-from torchgrasp.app.report.canvas import (
-    Camera,
-    Triangles,
-    concatenate,
-    frame_camera,
-    render,
-    sharp_normals,
-)
+from torchgrasp.app.report.canvas import frame_camera, sharp_normals
+from torchgrasp.app.report.raster import Camera, Triangles, concatenate, render
 
 WHITE = (1.0, 1.0, 1.0)
 RED = (1.0, 0.0, 0.0)

@@ -31,7 +31,12 @@ from torchgrasp.app.author.repair import (
     repair_bodies,
     repair_joints,
 )
-from torchgrasp.app.author.sensor_tips import add_seen_sensors, add_sensors, extend_pads
+from torchgrasp.app.author.sensor_tips import (
+    add_seen_sensors,
+    add_sensors,
+    extend_pads,
+    find_sensors,
+)
 from torchgrasp.app.author.unusual import find_unusual
 from torchgrasp.app.author.visuals import keep_visuals, mesh_files
 from torchgrasp.files import render, temporary_folder
@@ -202,12 +207,15 @@ def _draft(
     published: Urdf, wish: Wish, seed: int, file: str, origin: FromMjcf | None = None
 ) -> Draft:
     """Return the draft of `new_hand` for a URDF that was read, from an MJCF if it has an `origin`."""
+    # what is a part of the hand
     bare = _bare_links(published, wish.visual)
     folder = wish.meshes or published.path.parent
     reduced = _reduce(published, wish, folder)
     urdf = reduced.urdf
     surfaces = reduced.surfaces
     tips = _checked_tips(urdf, _tips(reduced, wish, origin), () if wish.visual else bare)
+
+    # where its pads are, and in which order the fingers grasp
     frames = _frames(urdf, (*tips, palm_of(urdf, tips)), seed)
     guess = guess_pads(urdf, frames, tips, surfaces)
     pads = extend_pads(tips, guess, wish.tip_offset, wish.tip_radius, bool(wish.tips))
@@ -217,11 +225,15 @@ def _draft(
     possible = {name: n for name, n in OPTIONS.items() if n <= len(tips)}
     sets = {name: [tips[k] for k in sorted(order[:n])] for name, n in possible.items()}
 
+    # simple shapes in place of its meshes
     clean, fitted = replace_meshes(urdf, reduced.points)
     clean, balls = _round_tips(urdf, clean, tips, guess, surfaces)
-    clean, sensors = add_sensors(clean, tips, guess, pads)
+    sensors = find_sensors(tips, guess, pads)
+    clean, extended = add_sensors(clean, sensors)
+
+    # what the user is told
     told = origin.told if origin else ()
-    repairs = [*told, *reduced.repairs, *fitted, *sensors, *balls]
+    repairs = [*told, *reduced.repairs, *fitted, *extended, *balls]
     warnings = [*(origin.warnings if origin else ()), *reduced.unusual]
     if bare and wish.visual:
         repairs.append(f"links without <collision> take their <visual>: {', '.join(bare)}")
@@ -232,17 +244,18 @@ def _draft(
         )
     warnings += _thin_tips(tips, surfaces)
 
-    names = wish.name or urdf.name, file if repairs else published.path.name
     options = _options(clean, sets)
     pairs, without = _part_pairs(clean, options, seed)
     warnings += without
     chosen = dict(zip(tips, pads, strict=True))
-    toml = _toml_text(clean, chosen, options, guess.approach, names, pairs, warnings)
+    name = wish.name or urdf.name
+    urdf_file = file if repairs else published.path.name
+    toml = _toml_text(clean, name, urdf_file, chosen, options, guess.approach, pairs, warnings)
     if not repairs:
         return Draft(toml, "", (), tuple(warnings))
     seen = keep_visuals(published, clean, reduced.mergers, folder)
-    files = mesh_files(add_seen_sensors(seen, tips, guess, pads))
-    text = _urdf_text(clean, {link: (name,) for link, (name, _) in files.items()})
+    files = mesh_files(add_seen_sensors(seen, sensors))
+    text = _urdf_text(clean, {link: path for link, (path, _) in files.items()})
     return Draft(toml, text, tuple(repairs), tuple(warnings), dict(files.values()))
 
 
@@ -365,9 +378,7 @@ def _part_pairs(
         if float((~met.any(0)).double().mean()) >= DRAFT.least_free:
             continue
         for (one, two), share in shares.items():
-            chain = {one, *(j.parent for j in urdf.joints_above(one))}
-            chain_of_two = {two, *(j.parent for j in urdf.joints_above(two))}
-            within = two in chain or one in chain_of_two
+            within = _hangs_on(urdf, one, two) or _hangs_on(urdf, two, one)
             if share >= (DRAFT.most_within if within else DRAFT.most_between):
                 left_out[one, two] = max(left_out[one, two], share)
         kept = torch.tensor([not left_out[pair] for pair in pairs])
@@ -389,6 +400,11 @@ def _part_pairs(
             f"they meet in these shares of random postures: {listed}",
         )
     return left_out, warnings
+
+
+def _hangs_on(urdf: Urdf, link: str, other: str) -> bool:
+    """Return whether a link is another one or below it."""
+    return link == other or any(j.parent == other for j in urdf.joints_above(link))
 
 
 @checked
@@ -493,21 +509,24 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
 
 def _toml_text(
     urdf: Urdf,
+    name: str,
+    file: str,
     pads: dict[str, Pad],
     options: Mapping[str, FingerSet],
     approach: Triple,
-    names: tuple[str, str],
     pairs: Mapping[tuple[str, str], float],
     warnings: Sequence[str],
 ) -> str:
-    """Return the text of a hand.toml from pads by tip, options by name, the names of hand and URDF
-    file, and pairs of links, each with the share with which it is left out.
+    """Return the text of a hand.toml: `name` is that of the hand, `file` that of the URDF.
+
+    `pads` are given by tip, `options` by name, and `pairs` of links with the share with which each
+    is left out.
     """
     kp, kd = _gains(urdf)
     return _render(
         "hand.toml",
-        name=names[0],
-        file=names[1],
+        name=name,
+        file=file,
         urdf=urdf,
         approach=approach,
         kp=kp,
@@ -522,9 +541,9 @@ def _toml_text(
     )
 
 
-def _urdf_text(urdf: Urdf, visuals: Mapping[str, tuple[str, ...]] | None = None) -> str:
-    """Return the text of a clean URDF, with the files of visual meshes by link."""
-    return _render("hand.urdf", urdf=urdf, sizes=SIZES, visuals=visuals or {})
+def _urdf_text(urdf: Urdf, visuals: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return the text of a clean URDF, with the file of the visual mesh of each link in `visuals`."""
+    return _render("hand.urdf", urdf=urdf, sizes=SIZES, visuals=visuals)
 
 
 def _render(template: str, **values: Any) -> str:

@@ -12,7 +12,6 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from torchgrasp.files import read_bounded
-from torchgrasp.files.write import Refuse
 from torchgrasp.foundation.errors import HandFileError
 from torchgrasp.foundation.limits import (
     HAND_MESH_BYTES,
@@ -27,12 +26,16 @@ from torchgrasp.hand.safe_xml import BoundedBuilder
 SECTIONS = {"compiler", "default", "asset", "worldbody", "contact", "equality", "tendon"}
 """The sections of an MJCF that are read, beside its actuators."""
 LEFT_OUT = {
-    **{"asset": ("texture", "material", "hfield", "skin")},
-    **{"default": ("material", "camera", "light")},
-    **{"body": ("camera", "light", "flexcomp"), "worldbody": ("camera", "light", "flexcomp")},
-    **{"geom": ("plugin",), "mesh": ("plugin",), "compiler": ("LRopt", "lengthrange")},
-    **{"frame": ("camera", "light", "flexcomp"), "actuator": ("plugin", "adhesion")},
-    **{"equality": ("flex", "flexvert", "flexstrain")},
+    "compiler": ("LRopt", "lengthrange"),
+    "default": ("material", "camera", "light"),
+    "asset": ("texture", "material", "hfield", "skin"),
+    "mesh": ("plugin",),
+    "worldbody": ("camera", "light", "flexcomp"),
+    "body": ("camera", "light", "flexcomp"),
+    "frame": ("camera", "light", "flexcomp"),
+    "geom": ("plugin",),
+    "equality": ("flex", "flexvert", "flexstrain"),
+    "actuator": ("plugin", "adhesion"),
 }
 """Elements that say nothing about a hand, by the element around them."""
 REFUSED = {
@@ -48,6 +51,7 @@ FOLDERS = ("assetdir", "meshdir", "texturedir", "strippath")
 MESHES = (".stl", ".obj", ".msh")
 MOST_FILES = 100  # included files
 SHOWN = 80  # letters of a wrong text that an error shows
+refuse = functools.partial(HandFileError, "mjcf")  # the error of this gate, as a function
 
 
 class SafeMjcf(NamedTuple):
@@ -89,40 +93,19 @@ def read_mjcf_text(path: Path, base: Path | None = None) -> SafeMjcf:
     Raises `HandFileError` for files that are missing, outside, malformed or too large, and for
     elements that make many bodies or read other models.
     """
-    refuse = functools.partial(HandFileError, "mjcf")
     left = Counter[str]()
-    spot = _Spot(path, (base or path.parent).resolve(), refuse)
+    spot = _Spot(path, (base or path.parent).resolve())
     root = _included(path, spot, [path.resolve()])
     count = sum(1 for _ in root.iter())
     if count > XML_ELEMENTS:
         raise refuse(f"{path} of {count} elements", f"at most {XML_ELEMENTS} elements")
-    folder = PurePosixPath(".")
-    bare = False
-    for compiler in root.iter("compiler"):
-        found = compiler.get("meshdir") or compiler.get("assetdir")
-        folder = PurePosixPath(found) if found else folder
-        bare = compiler.get("strippath", str(bare)).lower() == "true"
     for section in list(root):
         if section.tag not in SECTIONS and section.tag != "actuator":
             root.remove(section)
             left.update([section.tag] if section.tag == "deformable" else [])
     for element in root.iter():
-        _trim(path, element, refuse, left)
-    meshes = dict[str, bytes]()
-    size = 0
-    for mesh in root.iter("mesh"):
-        name = mesh.get("file")
-        if name is None:
-            continue
-        part = PurePosixPath(name).name if bare else name
-        data = _read_mesh(spot, folder / part, name)
-        size += len(data)
-        if size > HAND_MESH_BYTES:
-            raise refuse(f"{path} with meshes of more than {HAND_MESH_BYTES} bytes", "smaller ones")
-        kind = PurePosixPath(name).suffix.lower()
-        mesh.set("name", mesh.get("name") or PurePosixPath(name.replace("\\", "/")).stem)
-        mesh.set("file", f"mesh{len(meshes)}{kind}")
-        meshes[mesh.attrib["file"]] = data
+        _trim(path, element, left)
+    meshes = _read_meshes(spot, root)
     for compiler in root.iter("compiler"):
         for key in FOLDERS:
             compiler.attrib.pop(key, None)
@@ -133,11 +116,10 @@ def read_mjcf_text(path: Path, base: Path | None = None) -> SafeMjcf:
 
 
 class _Spot(NamedTuple):
-    """The file that the user named, the folder of all its files, and the error to raise."""
+    """The file that the user named, and the folder of all its files."""
 
     path: Path
     base: Path
-    refuse: Refuse
 
 
 def _included(path: Path, spot: _Spot, open_files: list[Path]) -> ET.Element:
@@ -145,8 +127,7 @@ def _included(path: Path, spot: _Spot, open_files: list[Path]) -> ET.Element:
 
     `open_files` are all files that were read so far.
     """
-    refuse = spot.refuse
-    root = _parse(path, refuse)
+    root = _parse(path)
     if root.tag not in ("mujoco", "mujocoinclude"):
         raise refuse(f"{path}: <{root.tag}>", "<mujoco> as the root element")
     # MuJoCo takes paths from the folder of the main file
@@ -165,7 +146,7 @@ def _included(path: Path, spot: _Spot, open_files: list[Path]) -> ET.Element:
     return root
 
 
-def _parse(path: Path, refuse: Refuse) -> ET.Element:
+def _parse(path: Path) -> ET.Element:
     """Return the XML tree of a file without declarations."""
     data = read_bounded(path, URDF_BYTES, "an MJCF file", refuse)
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
@@ -182,7 +163,7 @@ def _parse(path: Path, refuse: Refuse) -> ET.Element:
         raise refuse(f"{path}: {error}", "well-formed XML") from error
 
 
-def _trim(path: Path, element: ET.Element, refuse: Refuse, left: Counter[str]) -> None:
+def _trim(path: Path, element: ET.Element, left: Counter[str]) -> None:
     """Take off what the compiler need not see; raise an error for elements that are refused."""
     for part in list(element):
         tag = str(part.tag)
@@ -199,19 +180,40 @@ def _trim(path: Path, element: ET.Element, refuse: Refuse, left: Counter[str]) -
         raise refuse(found, f"names of at most {XML_LETTERS} printable letters")
 
 
-def _read_mesh(spot: _Spot, place: PurePosixPath, name: str) -> bytes:
-    """Return the bytes of a mesh that an MJCF calls `name`; its place is from the MJCF's folder."""
-    called = f"mesh {name[:SHOWN]!r}"
-    if PurePosixPath(name).suffix.lower() not in MESHES:
-        found = f"{spot.path}: {called} of another format"
-        raise spot.refuse(found, f"a mesh ({', '.join(MESHES)})")
-    file = _inside(spot, place, called)
-    return read_bounded(file, MESH_BYTES, "a mesh", spot.refuse)
+def _read_meshes(spot: _Spot, root: ET.Element) -> dict[str, bytes]:
+    """Return the bytes of all meshes of an MJCF by the names that they then have in its tree."""
+    folder = PurePosixPath(".")
+    bare = False  # whether the folders in the meshes' own paths do not count
+    for compiler in root.iter("compiler"):
+        found = compiler.get("meshdir") or compiler.get("assetdir")
+        folder = PurePosixPath(found) if found else folder
+        bare = compiler.get("strippath", str(bare)).lower() == "true"
+    meshes = dict[str, bytes]()
+    size = 0
+    for mesh in root.iter("mesh"):
+        name = mesh.get("file")
+        if name is None:
+            continue
+        called = f"mesh {name[:SHOWN]!r}"
+        kind = PurePosixPath(name).suffix.lower()
+        if kind not in MESHES:
+            found = f"{spot.path}: {called} of another format"
+            raise refuse(found, f"a mesh ({', '.join(MESHES)})")
+        file = _inside(spot, folder / (PurePosixPath(name).name if bare else name), called)
+        data = read_bounded(file, MESH_BYTES, "a mesh", refuse)
+        size += len(data)
+        if size > HAND_MESH_BYTES:
+            found = f"{spot.path} with meshes of more than {HAND_MESH_BYTES} bytes"
+            raise refuse(found, "smaller ones")
+        mesh.set("name", mesh.get("name") or PurePosixPath(name.replace("\\", "/")).stem)
+        mesh.set("file", f"mesh{len(meshes)}{kind}")
+        meshes[mesh.attrib["file"]] = data
+    return meshes
 
 
 def _inside(spot: _Spot, name: PurePosixPath, called: str) -> Path:
     """Return the path of a file that an MJCF names, from the folder of the MJCF."""
-    path, base, refuse = spot
+    path, base = spot
     folder = path.parent.resolve()
     allowed = f"a file below {base}, with slashes (--meshes names another folder)"
     if name.is_absolute() or ":" in str(name) or "\\" in str(name):

@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.app.author.repair import pose_of
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import chain_from_urdf, map_directions, map_points, pose_in_carrier
 from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf
@@ -204,8 +204,7 @@ def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
                 arm = arm - (arm @ axis) * axis
                 reach = max(float(np.linalg.norm(arm)), PADS.short_arm)
                 return joint, motion / length, arm / reach
-        above_from_link = rigid(rotation_from_rpy(joint.rpy), real(joint.xyz))
-        tip_from_above = tip_from_above @ np.linalg.inv(above_from_link.numpy())
+        tip_from_above = tip_from_above @ np.linalg.inv(pose_of(joint))
     raise BadArgument("tips", tip, "links that a joint moves")
 
 
@@ -221,7 +220,7 @@ def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
     shape = link.shapes[0]
     center = np.array(shape.xyz)
     half = np.array(shape.half)
-    rotation = rotation_from_rpy(shape.rpy).numpy()
+    rotation = pose_of(shape)[:3, :3]
     long = int(half.argmax())
     inset = half[long] - np.delete(half, long).min()
     return center + math.copysign(inset, rotation[:, long] @ center) * rotation[:, long]
@@ -237,7 +236,7 @@ def _pad(shape: LinkShape, core: Vector, motion: Vector, outward: Vector) -> Pad
         center = np.array(shape.xyz)
         normal = normal / np.linalg.norm(normal)
         return Pad(_triple(center + radius * normal), _triple(normal), _triple(center), radius)
-    rotation = rotation_from_rpy(shape.rpy).numpy()
+    rotation = pose_of(shape)[:3, :3]
     half = np.array(shape.half)
     side = rotation.T @ motion
     side[int(half.argmax())] = 0.0  # the pad is beside the tip, not at its end

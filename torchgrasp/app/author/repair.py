@@ -107,12 +107,7 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
         heavy = moved if bare_root else parent
         shapes = parent.shapes + moved.shapes
         merged = dataclasses.replace(heavy, name=parent.name, shapes=shapes)
-        others = [x for x in urdf.joints if x is not j]
-        below = tuple(_under(x, j) if x.parent == child.name else x for x in others)
-        kept = tuple(merged if x is parent else x for x in urdf.links if x is not child)
-        taken = {name: parent.name if to == child.name else to for name, to in taken.items()}
-        taken[child.name] = parent.name
-        urdf = dataclasses.replace(urdf, links=kept, joints=below)
+        urdf, taken = _merge(urdf, j, merged, taken)
 
 
 def merge_markers(
@@ -127,24 +122,31 @@ def merge_markers(
     taken: dict[str, str] = {}
     while marker := _marker(urdf, surfaces):
         (above,) = (j for j in urdf.joints if j.child == marker.name)
-        moved = _moved(marker, pose_of(above))
-        joints = tuple(
-            _under(j, above) if j.parent == marker.name else j
-            for j in urdf.joints
-            if j is not above
-        )
-        links = tuple(
-            _heavier(x, moved) if x.name == above.parent else x
-            for x in urdf.links
-            if x is not marker
-        )
-        taken = {name: above.parent if to == marker.name else to for name, to in taken.items()}
-        taken[marker.name] = above.parent
-        urdf = dataclasses.replace(urdf, links=links, joints=joints)
+        (parent,) = (x for x in urdf.links if x.name == above.parent)
+        merged = _heavier(parent, _moved(marker, pose_of(above)))
+        urdf, taken = _merge(urdf, above, merged, taken)
     done = [f"{name} into {to}" for name, to in taken.items()]
     most = f"{1e3 * REPAIRS.marker:g} mm"
     told = f"links smaller than {most} at fingertips, markers, are merged: {', '.join(done)}"
     return urdf, [told] if done else [], taken
+
+
+def _merge(
+    urdf: Urdf, joint: Joint, merged: Link, taken: Mapping[str, str]
+) -> tuple[Urdf, dict[str, str]]:
+    """Return the URDF without a joint and its child, and with `merged` in place of its parent.
+
+    `taken` gives for each link that was merged before the link that took it over. The second result
+    adds the child to it.
+    """
+    parent = joint.parent
+    child = joint.child
+    others = [j for j in urdf.joints if j is not joint]
+    joints = tuple(_under(j, joint) if j.parent == child else j for j in others)
+    left = [x for x in urdf.links if x.name != child]
+    links = tuple(merged if x.name == parent else x for x in left)
+    owners = {name: parent if to == child else to for name, to in taken.items()}
+    return dataclasses.replace(urdf, links=links, joints=joints), owners | {child: parent}
 
 
 def _marker(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Link | None:

@@ -6,6 +6,7 @@ the fingertip. The pad moves with it: its contact point by exactly the offset, i
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,66 +78,91 @@ def extend_pads(
     return tuple(found)
 
 
-def add_sensors(
-    urdf: Urdf, tips: Sequence[str], guess: Guess, pads: Sequence[Pad]
-) -> tuple[Urdf, list[str]]:
-    """Return the URDF with a sensor tip for each pad that `extend_pads` moved, and a sentence.
+class Sensor(NamedTuple):
+    """A sensor tip: its fingertip link, its moved pad, and its cylinder [m] in the link's frame.
 
-    The sentence is the only one in a list, which is empty if no pad moved. Masses stay as they are.
+    `way` (3,) is the unit vector along the cylinder, away from the maker's tip.
     """
+
+    tip: str
+    pad: Pad
+    way: np.ndarray
+    length: float
+
+    @property
+    def turn(self) -> np.ndarray:
+        """The axes (3, 3) of the cylinder as columns; the third points along it."""
+        flat = np.eye(3)[int(np.abs(self.way).argmin())]
+        one = np.cross(flat, self.way)
+        one /= np.linalg.norm(one)
+        return np.stack([one, np.cross(self.way, one), self.way], 1)
+
+
+def find_sensors(tips: Sequence[str], guess: Guess, pads: Sequence[Pad]) -> list[Sensor]:
+    """Return a sensor tip for each of the `pads` that `extend_pads` moved.
+
+    `guess` holds the pads before they were moved, and `pads` those afterwards, in the order of the
+    links `tips`.
+    """
+    found = []
+    for tip, before, way, pad in zip(tips, guess.pads, guess.outward, pads, strict=True):
+        if pad is not before:
+            length = float((np.array(pad.contact) - before.contact) @ way)
+            found.append(Sensor(tip, pad, way, length))
+    return found
+
+
+def add_sensors(urdf: Urdf, sensors: Sequence[Sensor]) -> tuple[Urdf, list[str]]:
+    """Return the URDF with sensor tips, and a sentence on them.
+
+    The sentence is the only one in a list, which is empty without sensors. Masses stay as they are.
+    """
+    if not sensors:
+        return urdf, []
     shapes = dict[str, tuple[LinkShape, ...]]()
     told = []
-    rows = zip(tips, guess.pads, guess.outward, pads, strict=True)
-    for tip, before, way, pad in rows:
-        if pad is before:
-            continue
-        offset = float((np.array(pad.contact) - before.contact) @ way)
+    for sensor in sensors:
+        tip, pad, way, length = sensor
         end = np.array(pad.center)
-        # the third column of the turn is the axis of the cylinder
-        turn = np.stack([*_across(way), way], 1)
-        neck = turned_shape("cylinder", (pad.radius, offset), turn, end - offset / 2 * way)
+        neck = turned_shape("cylinder", (pad.radius, length), sensor.turn, end - length / 2 * way)
         ball = turned_shape("sphere", (pad.radius,), np.eye(3), end)
         shapes[tip] = (neck, ball)
         x, y, z = (round(float(part), 3) + 0.0 for part in way)
         told.append(
-            f"{tip} {1e3 * offset:g} mm along ({x:g}, {y:g}, {z:g}) in its frame, "
+            f"{tip} {1e3 * length:g} mm along ({x:g}, {y:g}, {z:g}) in its frame, "
             f"radius {1e3 * pad.radius:g} mm"
         )
     links = tuple(
         dataclasses.replace(link, shapes=link.shapes + shapes.get(link.name, ()))
         for link in urdf.links
     )
-    sentences = [f"sensor tips are added: {'; '.join(told)}"] if told else []
-    return dataclasses.replace(urdf, links=links), sentences
+    return dataclasses.replace(urdf, links=links), [f"sensor tips are added: {'; '.join(told)}"]
 
 
 def add_seen_sensors(
-    seen: Mapping[str, Triangles], tips: Sequence[str], guess: Guess, pads: Sequence[Pad]
+    seen: Mapping[str, Triangles], sensors: Sequence[Sensor]
 ) -> dict[str, Triangles]:
-    """Return the visual meshes by link [m], with a capsule for each pad that `extend_pads` moved.
+    """Return the visual meshes by link [m], each with a capsule for its sensor tip.
 
-    `seen` are the meshes without sensors, and `guess` holds the pads before they were moved. `pads`
-    are those afterwards, in the order of the links `tips`.
+    `seen` are the meshes without sensors; a link that is not among them gets none.
     """
     shown = dict(seen)
-    for tip, before, way, pad in zip(tips, guess.pads, guess.outward, pads, strict=True):
-        if pad is before or tip not in shown:
+    for sensor in sensors:
+        tip, pad, way, length = sensor
+        if tip not in shown:
             continue
-        end = np.array(pad.center)
-        offset = float((np.array(pad.contact) - before.contact) @ way)
         # of radius 1 first: trimesh leaves out triangles of less than 1e-8 square units
         sides = SENSOR.sides, SENSOR.sides
-        capsule = trimesh.creation.capsule(offset / pad.radius, 1.0, count=sides)
+        capsule = trimesh.creation.capsule(length / pad.radius, 1.0, count=sides)
         capsule.apply_scale(pad.radius)
-        turn = np.eye(4)
-        turn[:3, :3] = np.stack([*_across(way), way], 1)
+        pose = np.eye(4)
+        pose[:3, :3] = sensor.turn
         # its middle is halfway between the balls, wherever trimesh begins it
         middle = capsule.bounds.mean(0)[2]
-        turn[:3, 3] = end - (offset / 2 + middle) * way
-        capsule.apply_transform(turn)
+        pose[:3, 3] = np.array(pad.center) - (length / 2 + middle) * way
+        capsule.apply_transform(pose)
         vertices, faces = shown[tip]
-        both = np.concatenate([faces, np.asarray(capsule.faces) + len(vertices)])
-        shown[tip] = np.concatenate([vertices, np.asarray(capsule.vertices)]), both
+        shown[tip] = trimesh.util.append_faces([vertices, capsule.vertices], [faces, capsule.faces])
     return shown
 
 
@@ -146,11 +172,3 @@ def _round_pad(contact: np.ndarray, normal: np.ndarray, radius: float) -> Pad:
     nx, ny, nz = (float(part) for part in normal)
     x, y, z = (float(part) for part in contact - radius * normal)
     return Pad((cx, cy, cz), (nx, ny, nz), (x, y, z), radius)
-
-
-def _across(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors that form a right-handed frame with a unit vector."""
-    flat = np.eye(3)[int(np.abs(way).argmin())]
-    one = np.cross(flat, way)
-    one /= np.linalg.norm(one)
-    return one, np.cross(way, one)

@@ -133,7 +133,7 @@ def _free_motion(
     start = np.linalg.lstsq(equal, values, rcond=None)[0] if len(equal) else joints.rest * 0
     if len(equal) and np.abs(equal @ start - values).max() > TENDONS.agree:
         raise Contradiction(joints.names)
-    free = _null(equal)  # (n, p)
+    _, free = _split(equal)  # (n, p)
     reached, left = _split(pulls @ free)
     motion = free @ reached
     slack = free @ left  # motions that no motor sets (n, s)
@@ -162,13 +162,10 @@ def _free_motion(
     return motion, offset, told
 
 
-def _null(matrix: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (n, p) of the vectors that a matrix (m, n) maps to zero."""
-    return _split(matrix)[1]
-
-
 def _split(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return bases of a matrix's row space and of the rest, as columns."""
+    """Return orthonormal bases of a matrix's row space, and of the vectors that it maps to zero, as
+    columns.
+    """
     n = matrix.shape[1]
     if not matrix.size:
         return np.zeros((n, 0)), np.eye(n)

@@ -95,9 +95,8 @@ def keep_visuals(
     for owner, some in parts.items():
         if owner in partial:
             continue
-        starts = np.cumsum([0, *(len(corners) for corners, _ in some)])
-        faces = [part + start for (_, part), start in zip(some, starts, strict=False)]
-        found[owner] = np.concatenate([corners for corners, _ in some]), np.concatenate(faces)
+        corners, faces = zip(*some, strict=True)
+        found[owner] = trimesh.util.append_faces(corners, faces)
     return found
 
 

@@ -37,7 +37,7 @@ CHAPTERS = {
     },
     "Exchange grasps with other programs": {
         "export": "export.Export",
-        "import": "export.Import",
+        "import": "importing.Import",
         "mcp": "agents.ServeAgents",
     },
     "Try many grasps in simulation": {
@@ -236,9 +236,9 @@ def format_help() -> str:
     return "\n".join(lines)
 
 
-def _sentence(error: GraspError) -> str:
-    """Return an error as one line of text."""
-    return " ".join(str(error).split())
+def _sentence(told: object) -> str:
+    """Return an error or a warning as one line of text."""
+    return " ".join(str(told).split())
 
 
 @contextlib.contextmanager
@@ -298,4 +298,4 @@ class _Terminated(KeyboardInterrupt):
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
     """Print a warning as one sentence on stderr, like an error."""
-    print(f"{category.__name__}: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"{category.__name__}: {_sentence(message)}", file=sys.stderr)

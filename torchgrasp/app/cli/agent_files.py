@@ -7,7 +7,7 @@ from torchgrasp.app.cli.inputs import object_name
 from torchgrasp.data.shipped import DATA, find_view, list_objects
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import check_path
-from torchgrasp.hand.load import hands_folder
+from torchgrasp.hand.load import list_hands
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +78,3 @@ class Workplace:
     def tell(self, path: Path) -> str:
         """Return the path of a file below the folder as an agent names it."""
         return path.relative_to(self.root).as_posix()
-
-
-def list_hands() -> tuple[str, ...]:
-    """Return the names of the shipped hands."""
-    return tuple(sorted(path.parent.name for path in hands_folder().glob("*/hand.toml")))

@@ -27,15 +27,9 @@ from typing import Annotated, Any, Literal
 import torch
 
 from torchgrasp import __version__
+from torchgrasp.app.cli.agent_answers import Answer, plain_answer
 from torchgrasp.app.cli.agent_files import Workplace
-from torchgrasp.app.cli.agent_tools import (
-    TOOLS,
-    Answer,
-    TellHealth,
-    Tool,
-    make_tool,
-    plain_answer,
-)
+from torchgrasp.app.cli.agent_tools import TOOLS, TellHealth, Tool, make_tool
 from torchgrasp.app.cli.agents import SERVER
 from torchgrasp.app.cli.command import naming
 from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra

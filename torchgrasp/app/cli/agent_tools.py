@@ -1,4 +1,4 @@
-"""The tools that `torchgrasp mcp` offers to agents: arguments with units and bounds, and answers.
+"""The tools that `torchgrasp mcp` offers to agents: arguments with units and bounds, and the work.
 
 A tool is a value whose fields are its arguments; `run` does the work. Tools share nothing but
 files, all of them below one folder.
@@ -7,7 +7,6 @@ files, all of them below one folder.
 import dataclasses
 import importlib.util
 import json
-import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,15 +14,30 @@ import numpy as np
 import torch
 
 from torchgrasp import __version__
-from torchgrasp.app.author.fit_shapes import shape_points
-from torchgrasp.app.author.unusual import find_unusual
-from torchgrasp.app.cli.agent_files import Workplace, list_hands
+from torchgrasp.app.cli.agent_answers import (
+    AdviceRow,
+    Answer,
+    ChangeRow,
+    CloseAnswer,
+    CloudAnswer,
+    ExplainAnswer,
+    GraspRow,
+    HandAnswer,
+    HealthAnswer,
+    LookRow,
+    LossRow,
+    PictureAnswer,
+    PlanAnswer,
+    ThingRow,
+    Vector,
+)
+from torchgrasp.app.cli.agent_files import Workplace
 from torchgrasp.app.cli.clouds import CloudCheck
 from torchgrasp.app.cli.command import naming, option, required
 from torchgrasp.app.cli.depth_images import CloudScene
 from torchgrasp.app.cli.doctor import SIMULATORS
-from torchgrasp.app.cli.grasp import ENOUGH, Grasp, describe_look, find_look, read_true_mesh
-from torchgrasp.app.cli.hands import TRIAL, describe, find_warnings, list_faults
+from torchgrasp.app.cli.grasp import Grasp
+from torchgrasp.app.cli.hands import TRIAL, describe, find_warnings, list_faults, list_unusual
 from torchgrasp.app.cli.inputs import (
     CLOUD_HELP,
     HAND_HELP,
@@ -38,18 +52,27 @@ from torchgrasp.app.cli.inputs import (
     read_distribution,
     read_table,
 )
-from torchgrasp.app.report.page import write_report
-from torchgrasp.app.report.run_data import Run, verdict
+from torchgrasp.app.cli.results import (
+    ENOUGH,
+    GRASPS,
+    REPORT,
+    SURFACE,
+    describe_look,
+    make_run,
+    read_true_mesh,
+    table_under,
+    write_run,
+)
+from torchgrasp.app.report.run_data import verdict
 from torchgrasp.app.report.stills import draw_grasp, facing, rotated
-from torchgrasp.app.report.viewer import VIEW, write_viewer
+from torchgrasp.app.report.viewer import VIEW
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.contacts.region import Region
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.data.shipped import list_objects
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.export import format_grasps, save_surface
-from torchgrasp.export.play import stand
+from torchgrasp.export import format_grasps
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, GraspError, Status
@@ -60,8 +83,7 @@ from torchgrasp.geometry.plane import Plane, as_plane, move, upright_frame, upri
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.abilities import hand_abilities, random_joints
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.load import hand_of
-from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.hand.load import hand_of, list_hands
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.objects import take_target
@@ -71,18 +93,14 @@ from torchgrasp.scene.file import read_scene, save_scene
 from torchgrasp.scene.image import is_scene
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.second_view import NextView
-from torchgrasp.shape.surface import Surface, extract_surface
-from torchgrasp.success.reasons import explain_success
+from torchgrasp.shape.surface import Surface
 from torchgrasp.success.task import GraspTask
 from torchgrasp.testing import check_hand
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps, PointCloud, format_success
 from torchgrasp.values.specs import FRICTIONS, MASSES, ContactSpec, Simulator, TrialSpec
 
-GRASPS = "grasps.safetensors"
-JSON = "grasps.json"
-SURFACE = "surface.ply"
-"""Names of the files that planning writes into its folder."""
+JSON = "grasps.json"  # file beside the others that planning writes into its folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +113,6 @@ class ToolBounds:
     some: int = 3  # grasps of an answer by default
     hold: float = 10.0  # longest time for which the raised object is held [s]
     points: int = 20_000  # most points of a rendered view: a shape is fitted to fewer
-    digits: int = 6  # decimals of numbers in answers [m, rad]: micrometres
 
 
 BOUNDS = ToolBounds()
@@ -109,7 +126,6 @@ def _help_of(command: Any) -> dict[str, str]:
 VIEW_HELP = _help_of(CloudOptions)
 PLAN_HELP = _help_of(Grasp)
 DEPTH_HELP = _help_of(CloudScene)
-Vector = tuple[float, float, float]
 Box = tuple[float, float, float, float, float, float]
 Starts = Annotated[int, Range(1, BOUNDS.starts)]
 Shown = Annotated[int, Range(1, BOUNDS.listed)]
@@ -127,186 +143,13 @@ def law_of(name: str, given: float | str) -> float | Distribution:
     return read_distribution(name, given) if isinstance(given, str) else given
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Answer:
-    """What a tool answers. `picture`, the bytes of a PNG, is no part of its text."""
-
-    notes: tuple[str, ...] = option((), "what was noticed, such as advice for a better cloud")
-    picture: bytes | None = dataclasses.field(default=None, repr=False)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class GraspRow:
-    """An executable grasp: poses [m] in the frame of the cloud, joints [rad] by name."""
-
-    rank: int = required("0 is the best")
-    success: float | None = required(
-        "predicted probability that the object is lifted and held; null if it is unknown"
-    )
-    interval: tuple[float, float] | None = required(
-        "bounds of the share of such grasps that held in trials (95 % over families of objects)"
-    )
-    position: Vector = required("origin of the hand's root link in the frame of the cloud [m]")
-    quaternion_wxyz: tuple[float, float, float, float] = required(
-        "rotation of the hand's root link in the frame of the cloud, a unit quaternion w x y z"
-    )
-    approach: Vector = required("unit direction in which the opened hand comes to its pose")
-    rise: Vector = required(
-        "displacement [m] of the opened hand from its pose, until it closes: not zero where it "
-        "would be in the table"
-    )
-    pregrasp: dict[str, float] = required("positions of all joints of the opened hand [rad]")
-    grasp: dict[str, float] = required("positions at which the fingertips touch [rad]")
-    squeeze: dict[str, float] = required("targets of position-controlled joints that press [rad]")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ThingRow:
-    """An object of a scene."""
-
-    label: int = required("label of the object")
-    success: float | None = required("predicted success of its best grasp; null if it is unknown")
-    reason: str = required("why it has no grasp; empty if it has one")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LookRow:
-    """A camera from which a second view would help. Standard deviations are at the contacts."""
-
-    obj_from_camera_m: tuple[tuple[float, ...], ...] = required(
-        "pose of the camera in the frame of the grasps, 4 x 4: x right, y down, z forward"
-    )
-    turn_deg: float | None = required("angle to the nearest earlier camera; null if none is known")
-    std_before_m: float = required("mean standard deviation of the surface now [m]")
-    std_after_m: float = required("the same as expected with the second view [m]")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PlanAnswer(Answer):
-    """The result of planning. Without an executable grasp, `explain_empty` says what would help."""
-
-    verdict: str = required("the result in a sentence")
-    hand: str = required("name of the hand")
-    fingers: tuple[str, ...] = required("names of the fingers that grasp")
-    executable: int = required("number of grasps that passed every check")
-    planned: int = required("number of postures that were checked")
-    grasps: tuple[GraspRow, ...] = required("the best executable grasps, the best first")
-    lowers_success: tuple[str, ...] = option((), "what lowers the success of the best grasp most")
-    look_next: LookRow | None = option(None, "from where a second view would raise the success")
-    objects: tuple[ThingRow, ...] = option((), "objects of the scene, if none was chosen")
-    grasps_file: str | None = option(None, "all grasps, for close_in_simulation and show")
-    json_file: str | None = option(None, "the listed grasps with contacts, forces and torques")
-    surface_file: str | None = option(None, "the estimated surface of the object [m]")
-    seen_file: str | None = option(None, "the cloud or scene that was planned on")
-    pages: tuple[str, ...] = option((), "pages for a person: a report, and the grasp in 3D")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LossRow:
-    """A stage of planning and what it lost."""
-
-    stage: str = required("name of the stage")
-    given: int = required("number of things that it was given")
-    kept: int = required("number of things that it kept")
-    things: str = required("word for these things")
-    reasons: dict[str, int] = required("number of lost things, by the sentence that says why")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ChangeRow:
-    """A change that was tried by planning with it."""
-
-    change: str = required("the change in words")
-    choice: bool = required("whether the user can make it; otherwise it changes the world")
-    executable: int = required("number of executable grasps with it")
-    expected: float = required("mean predicted success of the best grasps with it")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ExplainAnswer(Answer):
-    """Why a plan has no grasp, and which single change would help most."""
-
-    advice: str = required("what would help most, in a sentence")
-    starts: int = required("number of initial guesses of each plan")
-    stages: tuple[LossRow, ...] = required("where grasps were lost")
-    changes: tuple[ChangeRow, ...] = required("changes that were tried, the most helpful first")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class AdviceRow:
-    """A fault of a cloud and what mends it."""
-
-    found: str = required("the fault")
-    fix: str = required("what mends it")
-    refused: bool = required("whether no grasp is planned on such a cloud")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CloudAnswer(Answer):
-    """The measured quality of a cloud."""
-
-    usable: bool = required("whether grasps are planned on the cloud")
-    advice: tuple[AdviceRow, ...] = required("faults of the cloud; refusals come first")
-    points: int = required("number of points")
-    size: Vector = required("sides of the box along the axes [m]")
-    spacing: float = required("median distance to the nearest point [m]")
-    noise: float = required("median noise about local planes [m]")
-    outliers: int = required("number of points far from the others")
-    camera_given: bool = required("whether the camera's position is given; else it is estimated")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class HandAnswer(Answer):
-    """The faults of a hand or, if it has none, what it is."""
-
-    sound: bool = required("whether the hand has no fault")
-    faults: tuple[str, ...] = required("every fault, with its fix")
-    sets: dict[str, tuple[str, ...]] | None = option(
-        None, "fingers of each declared set, by its name"
-    )
-    joints: tuple[str, ...] = option((), "names of the actuated joints")
-    description: str = option("", "joints, fingers and random postures in words")
-    abilities: dict[str, Any] | None = option(
-        None,
-        "what the chosen fingers can do, as abilities.json of `hand check`: widths [m], spans [m] "
-        "and forces at the tips [N]; units are in the names",
-    )
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CloseAnswer(Answer):
-    """The result of closing the hand on the true object in simulation, lifting and holding it."""
-
-    held: bool = required("whether the object was lifted with the hand and slipped little")
-    status: str = required("name of the outcome")
-    sentence: str = required("the result in a sentence")
-    rise: float | None = required("height by which the object rose [m]")
-    slip: float | None = required("distance by which it moved in the closed hand [m]")
-    slip_angle: float | None = required("angle by which it turned in the closed hand [rad]")
-    touched: tuple[str, ...] = required("fingers that touched, in the order of first contacts")
-    time: float = required("simulated time [s]")
-    simulator: str = required("name of the simulator")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PictureAnswer(Answer):
-    """A picture of a hand on its object."""
-
-    caption: str = required("what the picture shows")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class HealthAnswer(Answer):
-    """The state of the server."""
-
-    version: str = required("version of torchgrasp")
-    folder: str = required("the folder of all files")
-    hands: tuple[str, ...] = required("names of the shipped hands")
-    objects: tuple[str, ...] = required("names of the shipped objects, each with a view and a mesh")
-    simulators: tuple[str, ...] = required("installed simulators")
-    gpu: bool = required("whether a graphics card is visible; no tool needs one")
-    busy: bool = option(False, "whether a call is being worked on; others wait")
-    seconds: float = option(0.0, "longest time of a call [s]")
+def region_of(name: str, box: Box | None) -> Region | None:
+    """Return the box [m] that the argument `name` gives as a region; None for None."""
+    if box is None:
+        return None
+    low, high = real(box).split(3)
+    with naming(low=name):
+        return Region.box(low, high)
 
 
 class Tool:
@@ -361,6 +204,18 @@ class _Seen:
     table: Plane | float | None
     notes: tuple[str, ...] = ()
 
+    @classmethod
+    def in_scene(cls, path: Path, scene: Scene) -> "_Seen":
+        """Return what is seen in the scene of a file."""
+        return cls(path, scene, scene.table, (*scene.notes, *scene.advice))
+
+    @property
+    def name(self) -> str:
+        """The name of the object that is grasped."""
+        if isinstance(self.source, Scene):
+            return f"object {self.source.target}"
+        return object_name(self.path)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _HandTool(Tool):
@@ -386,12 +241,12 @@ class _HandTool(Tool):
 
     def task(self) -> dict[str, Any]:
         """Return the options of the planner that say what the grasps must do, and where."""
-        regions = {}
-        for name, box in (("keep", self.keep), ("avoid", self.avoid)):
-            with naming(low=name):
-                low, high = real(box or [0.0] * 6).split(3)
-                regions[name] = None if box is None else Region.box(low, high)
-        return {"task": self.grasp_task, "promise": self.promise, **regions}
+        return {
+            "task": self.grasp_task,
+            "promise": self.promise,
+            "keep": region_of("keep", self.keep),
+            "avoid": region_of("avoid", self.avoid),
+        }
 
     @property
     def law(self) -> float | Distribution:
@@ -414,7 +269,7 @@ class _PlanTool(_HandTool):
         None, "folder to write below the server's folder; by default out/ and the object's name"
     )
 
-    def plan(self, place: Workplace, seen: _Seen, out: Path, name: str) -> PlanAnswer:
+    def plan(self, place: Workplace, seen: _Seen, out: Path) -> PlanAnswer:
         """Plan grasps of what is seen, write them into a folder, and return the answer."""
         hand, among = self.load(place)
         spec = ContactSpec(friction=self.law, table=seen.table)
@@ -429,56 +284,48 @@ class _PlanTool(_HandTool):
             **self.task(),
             observer=lambda stage, _, value: told.update({stage: value}),
         )
-        return self.write(place, seen, out, name, hand_of(grasps, hand), grasps, told)
+        return self.write(place, seen, out, hand, grasps, told)
 
     def write(
         self,
         place: Workplace,
         seen: _Seen,
         out: Path,
-        name: str,
         hand: Hand,
         grasps: Grasps,
         told: dict[str, Any],
     ) -> PlanAnswer:
-        """Write grasps with the surface and pages of their plan; return the answer."""
+        """Write grasps with the surface and pages of their plan; return the answer.
+
+        `told` holds the estimated "shape" and, if it is known, the "plan" of contacts.
+        """
         scene = seen.source if isinstance(seen.source, Scene) else None
         cloud = take_target(scene, self.seed) if scene is not None else seen.source
         assert isinstance(cloud, PointCloud)
-        good = grasps[grasps.status == Status.OK]
-        costs = [
-            cost.sentence
-            for best in good[:1]
-            for cost in explain_success(best, hand, told["shape"], self.grasp_task)
-        ]
         spec = ContactSpec(friction=self.law, table=seen.table)
-        surface = extract_surface(told["shape"])
-        look = find_look(told["shape"], grasps, spec)
-        run = Run(name, seen.path, cloud, hand, spec, surface, grasps, plan=told.get("plan"))
-        run = dataclasses.replace(run, scene=scene, costs=tuple(costs), look=look)
-        grasps.save(out / GRASPS)
+        given = (seen.name, seen.path, cloud, hand, spec, grasps, told["shape"], self.grasp_task)
+        run = make_run(*given, plan=told.get("plan"), scene=scene)
+        write_run(out, run, self.pages)
         files = dict[str, Any](grasps_file=place.tell(out / GRASPS))
+        good = run.executable
         rows = list[GraspRow]()
         if len(good):
-            content = format_grasps(hand, good[: self.most])
+            content = format_grasps(run.hand, good[: self.most])
             rows = [_row(row, good) for row in json.loads(content)["grasps"]]
             write_file(out / JSON, content)
-            save_surface(stand(surface, grasps.table), out / SURFACE)
             files["json_file"] = place.tell(out / JSON)
             files["surface_file"] = place.tell(out / SURFACE)
         if self.pages:
-            report = write_report(out / "report.html", run, VIEW)
-            viewer = write_viewer(out / VIEW, run)
-            files["pages"] = (place.tell(report), place.tell(viewer))
+            files["pages"] = (place.tell(out / REPORT), place.tell(out / VIEW))
         return PlanAnswer(
             verdict=verdict(run),
-            hand=hand.name,
-            fingers=hand.finger_names,
+            hand=run.hand.name,
+            fingers=run.hand.finger_names,
             executable=len(good),
             planned=len(grasps),
             grasps=tuple(rows),
             lowers_success=run.costs,
-            look_next=None if look is None else _look_row(look),
+            look_next=None if run.look is None else _look_row(run.look),
             notes=seen.notes,
             **files,
         )
@@ -522,7 +369,7 @@ class PlanFromCloud(_PlanTool, _SeenTool):
         seen = self.see(place, path)
         check_folder(out)
         with holding("out", out):
-            answer = self.plan(place, seen, out, object_name(path))
+            answer = self.plan(place, seen, out)
         return dataclasses.replace(answer, seen_file=self.cloud)
 
 
@@ -561,12 +408,12 @@ class PlanFromDepth(_PlanTool):
         out = place.out(self.out, path)
         scene = self.see(place, path)
         check_folder(out)
-        seen = _Seen(path, scene, scene.table, (*scene.notes, *scene.advice))
+        seen = _Seen.in_scene(path, scene)
         file = out / "scene.npz"
         with holding("out", out):
             if scene.target is not None:
                 save_scene(scene, file)
-                answer = self.plan(place, seen, out, f"object {scene.target}")
+                answer = self.plan(place, seen, out)
             else:
                 answer = self.choose(place, seen, scene, out, file)
         return dataclasses.replace(answer, seen_file=place.tell(file))
@@ -635,9 +482,7 @@ class PlanFromDepth(_PlanTool):
         notes = dict.fromkeys((*seen.notes, *chosen.advice))
         seen = dataclasses.replace(seen, source=chosen, notes=tuple(notes))
         told = {"shape": best.shape}
-        hand = hand_of(best.grasps, hand)
-        name = f"object {best.label}"
-        answer = self.write(place, seen, out, name, hand, best.grasps, told)
+        answer = self.write(place, seen, out, hand, best.grasps, told)
         return dataclasses.replace(answer, objects=rows)
 
 
@@ -673,7 +518,7 @@ class PlanFromMesh(_PlanTool):
         file = out / "view.npz"
         with holding("out", out):
             save_cloud(cloud, file, table)
-            answer = self.plan(place, _Seen(path, cloud, table), out, object_name(path))
+            answer = self.plan(place, _Seen(path, cloud, table), out)
         return dataclasses.replace(answer, seen_file=place.tell(file))
 
 
@@ -696,7 +541,7 @@ class ExplainEmpty(_HandTool, _SeenTool):
         if is_scene(path):
             scene = read_scene(path)
             scene = scene if self.label is None else scene.select(self.label)
-            seen = _Seen(path, scene, scene.table, (*scene.notes, *scene.advice))
+            seen = _Seen.in_scene(path, scene)
         elif self.label is not None:
             raise BadArgument("label", "a label beside a cloud", "a scene, which has labels")
         else:
@@ -788,8 +633,6 @@ class CheckHand(Tool):
         except GraspError as error:  # a law of kinematics that the hand breaks
             return HandAnswer(sound=False, faults=(str(error),))
         joints = random_joints(hand, TRIAL.postures)
-        urdf = read_urdf(hand.urdf_path)
-        unusual = find_unusual(urdf, shape_points(urdf, urdf.path.parent))
         return HandAnswer(
             sound=True,
             faults=(),
@@ -797,7 +640,7 @@ class CheckHand(Tool):
             joints=hand.joint_names,
             description=describe(hand, joints),
             abilities=hand_abilities(hand, TRIAL.postures).content(),
-            notes=(*unusual, *find_warnings(hand, joints)),
+            notes=(*list_unusual(hand), *find_warnings(hand, joints)),
         )
 
 
@@ -859,10 +702,7 @@ class CloseInSimulation(_GraspTool):
             hold_time=self.hold_time,
             simulator=self.simulator,
         )
-        plane = grasp.table
-        if plane is not None:  # the plan may have guessed its height, which the true mesh tells
-            lowest = float((mesh.vertices @ plane.normal.numpy()).min())
-            plane = dataclasses.replace(plane, offset=lowest)
+        plane = table_under(mesh, grasp.table)
         field = None
         if felt.is_file():
             surface = _read_surface(felt)
@@ -981,24 +821,3 @@ def make_tool(name: str, given: dict[str, Any]) -> Tool:
         key: tuple(value) if isinstance(value, list) else value for key, value in given.items()
     }
     return TOOLS[name](**listed)
-
-
-def plain_answer(answer: Answer) -> dict[str, Any]:
-    """Return an answer without its picture as values of JSON; NaN and infinity are null."""
-    fields = dataclasses.fields(answer)
-    named = {field.name: getattr(answer, field.name) for field in fields}
-    named.pop("picture")
-    return _plain(named)
-
-
-def _plain(value: Any) -> Any:
-    """Return a value of an answer as JSON has it, with rounded numbers."""
-    if dataclasses.is_dataclass(value):
-        return {name: _plain(x) for name, x in vars(value).items()}
-    if isinstance(value, dict):
-        return {key: _plain(x) for key, x in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(x) for x in value]
-    if isinstance(value, float):
-        return round(value, BOUNDS.digits) if math.isfinite(value) else None
-    return value

@@ -256,8 +256,15 @@ def make_bar(total: int | None, unit: str, **options: Any) -> "_Beating":
 class _Beating(tqdm):
     """A progress bar that prints a line from time to time where there is no terminal."""
 
-    done = 0
-    ended: threading.Event | None = None
+    def __init__(self, *, unit: str, desc: str = "", **options: Any) -> None:
+        super().__init__(unit=unit, desc=desc, **options)
+        self.named = unit
+        self.done = 0
+        self.began = time.monotonic()
+        self.ended: threading.Event | None = None
+        if self.disable:
+            self.desc = desc  # tqdm keeps none for a bar that it does not draw
+            self.ended = None if QUIET.get() else threading.Event()
 
     def update(self, n: int | float | None = 1) -> bool | None:
         """Count `n` more steps as done."""
@@ -266,19 +273,10 @@ class _Beating(tqdm):
 
     def describe(self) -> str:
         """Return how many steps are done, and the seconds since the start."""
-        label = getattr(self, "desc", None)
-        name = f"{label.rstrip(': ')}: " if label else ""
+        label = f"{self.desc.rstrip(': ')}: " if self.desc else ""
         of = f" of {self.total}" if self.total else ""
         seconds = time.monotonic() - self.began
-        return f"{name}{self.done}{of} {getattr(self, 'named', 'step')}s, {seconds:.0f} s"
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.named = options.get("unit", "step")
-        self.desc = getattr(self, "desc", None) or options.get("desc", "")
-        self.began = time.monotonic()
-        if self.disable and not QUIET.get():
-            self.ended = threading.Event()
+        return f"{label}{self.done}{of} {self.named}s, {seconds:.0f} s"
 
     def __enter__(self) -> "_Beating":
         """Begin to print lines, if the bar is not drawn."""

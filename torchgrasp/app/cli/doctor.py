@@ -18,7 +18,7 @@ from torchgrasp.app.cli.command import Command, ForPrograms, answer, arguments, 
 from torchgrasp.app.cli.inputs import import_simulator
 from torchgrasp.files import format_columns
 from torchgrasp.foundation.errors import BadArgument, MissingExtra
-from torchgrasp.hand.load import hands_folder
+from torchgrasp.hand.load import list_hands
 from torchgrasp.values.specs import Simulator
 
 CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", "safetensors")
@@ -76,7 +76,7 @@ class Doctor(ForPrograms):
 
 def find_parts() -> list[Finding]:
     """Return the state of every part of the installation."""
-    hands = ", ".join(sorted(p.parent.name for p in hands_folder().glob("*/hand.toml")))
+    hands = ", ".join(list_hands())
     gpu = "none visible to torch; everything runs on the processor"  # no fault
     if torch.cuda.is_available():
         gpu = f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}"

@@ -53,6 +53,7 @@ from torchgrasp.files import (
 )
 from torchgrasp.foundation.errors import BadArgument, DatasetError, Status
 from torchgrasp.foundation.rules import Count, Range, Seed
+from torchgrasp.hand.hand import Hand
 from torchgrasp.values.specs import ClosingMode, HoldingMode, Simulator
 
 NAME_WIDTHS = (12, 6)  # of the names of object and view, where their longest is not known yet
@@ -179,38 +180,20 @@ class Evaluate(_Trials, ForPrograms):
         """Evaluate the objects, write the results and print the summary; return the exit code."""
         import_simulator(self.simulator)
         hand, among = load_fingers(self.hand, self.fingers)
-        test = self.disturbed(find_protocol(self.protocol))
-        truth = {
-            name: read_distribution(f"--{name}", text)
-            for name in ("friction", "mass")
-            if (text := getattr(self, name)) is not None
-        }
-        holding = self.holding or (self.force and "force")
-        test = test.with_trial(**self.trial(force=self.force, holding=holding, **truth))
+        test = self._test()
         spec = EvaluationSpec(
-            self.grasps,
-            self.ranks,
-            self.starts,
-            self.complete,
-            self.only,
-            self.planned is not None,
-            self.seed,
-            self.views,
-            among,
+            grasps=self.grasps,
+            ranks=self.ranks,
+            starts=self.starts,
+            complete=self.complete,
+            only=self.only,
+            planned=self.planned is not None,
+            seed=self.seed,
+            views=self.views,
+            fingers=among,
         )
-        scores = []
         with hold_folder(self.out):
-            folder = self.planned or self.out / "grasps"
-            found = evaluate(self.objects, hand, test, spec, folder=folder, workers=self.workers)
-            names = list_names(self.objects, spec)
-            widths = max(len(ascii(name)) for name, _ in names), max(len(view) for _, view in names)
-            _print_cells(("object", "view", *COUNT_HEADS), widths)
-            with make_bar(sum(view != "" for _, view in names), "view") as bar:
-                for score in found:
-                    with bar.external_write_mode(sys.stdout):
-                        print_score(score, widths)
-                    bar.update()
-                    scores.append(score)
+            scores = self._score(hand, test, spec)
             summary = summarise(scores)
             print_summary(self.protocol, spec.tried, summary)
             asked: dict[str, Any] = {
@@ -231,6 +214,35 @@ class Evaluate(_Trials, ForPrograms):
             write_evaluation(self.out / "evaluate.html", title, asked, scores)
         return 0
 
+    def _test(self) -> evaluation.Protocol:
+        """Return the protocol with all options that the user set."""
+        test = self.disturbed(find_protocol(self.protocol))
+        truth = {
+            name: read_distribution(f"--{name}", text)
+            for name in ("friction", "mass")
+            if (text := getattr(self, name)) is not None
+        }
+        holding = self.holding or (self.force and "force")
+        return test.with_trial(**self.trial(force=self.force, holding=holding, **truth))
+
+    def _score(
+        self, hand: Hand, test: evaluation.Protocol, spec: EvaluationSpec
+    ) -> list[ViewScore]:
+        """Evaluate all views, and print a line for each; return their scores."""
+        folder = self.planned or self.out / "grasps"
+        found = evaluate(self.objects, hand, test, spec, folder=folder, workers=self.workers)
+        names = list_names(self.objects, spec)
+        widths = max(len(ascii(name)) for name, _ in names), max(len(view) for _, view in names)
+        _print_cells(("object", "view", *COUNT_HEADS), widths)
+        scores = []
+        with make_bar(sum(view != "" for _, view in names), "view") as bar:
+            for score in found:
+                with bar.external_write_mode(sys.stdout):
+                    print_score(score, widths)
+                bar.update()
+                scores.append(score)
+        return scores
+
 
 def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
     """Return object name and view name of every view of the folder `objects` that is evaluated.
@@ -245,7 +257,7 @@ def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
     return names
 
 
-def print_score(score: ViewScore, widths: tuple[int, int] = NAME_WIDTHS) -> None:
+def print_score(score: ViewScore, widths: tuple[int, int]) -> None:
     """Print one line with the result of a view.
 
     `widths` are the widths [characters] of the columns with the names of object and view.
@@ -280,16 +292,11 @@ def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
     for name, group in summary["by_group"].items():
         rows += [(f"{name}: {text}", format_share(group[key])) for key, text in SHARE_NAMES.items()]
     if len(summary["fingers"]) > 1:
-        rows.append(
-            (
-                "views by fingers",
-                "; ".join(f"{n} {names}" for names, n in summary["fingers"].items()),
-            )
-        )
+        sets = [f"{n} {names}" for names, n in summary["fingers"].items()]
+        rows.append(("views by fingers", "; ".join(sets)))
     for stage, reasons in summary["failures"].items():
-        rows.append(
-            (f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items()))
-        )
+        lost = [f"{n} {name.lower()}" for name, n in reasons.items()]
+        rows.append((f"failed in {stage}", ", ".join(lost)))
     rows += [(f"not held: {name}", text) for name, text in list_causes(summary)]
     print(f"\n{protocol}, {tried}\n{format_columns([*rows, *list_figures(summary)], left={0, 1})}")
 
@@ -339,11 +346,8 @@ class RunCampaign(_Trials):
         )
         test = find_protocol(self.protocol).with_trial(**self.trial())
         spec = CampaignSpec(test, trials, self.licence, self.jobs_in_shard, self.device)
-        source, name = (
-            (self.workers, "--workers")
-            if self.scheduler is None
-            else (self.scheduler, "--scheduler")
-        )
+        source = self.workers if self.scheduler is None else self.scheduler
+        name = "--workers" if self.scheduler is None else "--scheduler"
         with naming(workers=name), make_bar(len(list_names(self.objects, trials)), "job") as bar:
             _print_cells(("object", "view", *COUNT_HEADS), NAME_WIDTHS)
 
@@ -356,13 +360,10 @@ class RunCampaign(_Trials):
 
             data = run_campaign(self.objects, hand, self.out, spec, source, show)
         counts = data.card["counts"]
-        print(
-            f"{counts['jobs']} jobs: "
-            f"{', '.join(f'{n} {name.lower()}' for name, n in counts['status'].items())}"
-        )
-        print(
-            f"{len(data)} grasps, {counts['passed']} of {counts['tries']} tries passed: {self.out}"
-        )
+        ended = ", ".join(f"{n} {name.lower()}" for name, n in counts["status"].items())
+        print(f"{counts['jobs']} jobs: {ended}")
+        passed = f"{counts['passed']} of {counts['tries']} tries passed"
+        print(f"{len(data)} grasps, {passed}: {self.out}")
         if self.parquet is not None:
             with naming(folder="--parquet", path="--parquet", data="OBJECTS"):
                 write_parquet(data, self.parquet)

@@ -1,6 +1,5 @@
 """The command `torchgrasp film`, which closes the hand in simulation and writes a moving picture."""
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated
 
@@ -13,8 +12,8 @@ from torchgrasp.app.cli.command import (
     positional,
     required,
 )
-from torchgrasp.app.cli.grasp import read_true_mesh
 from torchgrasp.app.cli.inputs import SEED_HELP, check_folder, import_simulator
+from torchgrasp.app.cli.results import GRASPS, SURFACE, read_true_mesh, table_under
 from torchgrasp.app.report.moving_picture import Rate, check_kind, write_film
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.evaluation.lift import close_hand
@@ -22,9 +21,6 @@ from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.hand.load import hand_of
 from torchgrasp.values.specs import Simulator, TrialSpec
-
-FILE = "grasps.safetensors"  # of a folder that `torchgrasp grasp` wrote
-SURFACE = "surface.ply"  # likewise, the estimated surface
 
 
 @arguments(path="out", closure="grasps", mesh="mesh")
@@ -60,7 +56,7 @@ class Film(Command):
             check_kind(self.out)
         check_folder(self.out.parent)
         import_simulator(self.simulator)
-        file = self.grasps / FILE if self.grasps.is_dir() else self.grasps
+        file = self.grasps / GRASPS if self.grasps.is_dir() else self.grasps
         with naming(path="GRASPS"):
             planned = load_grasps(file)
         good = planned[planned.status == Status.OK]
@@ -74,10 +70,7 @@ class Film(Command):
             hand = hand_of(good, self.hand)
         grasp = good[self.number]
         body, parts = read_true_mesh(mesh)
-        table = grasp.table
-        if table is not None:
-            lowest = float((body.vertices @ table.normal.numpy()).min())
-            table = dataclasses.replace(table, offset=lowest)
+        table = table_under(body, grasp.table)
         spec = TrialSpec(mass=self.mass, friction=self.friction, simulator=self.simulator)
         closure = close_hand(grasp, hand, body, spec, seed=self.seed, parts=parts, table=table)
         with make_bar(None, "picture", desc="film") as bar:

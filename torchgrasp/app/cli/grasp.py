@@ -3,8 +3,8 @@
 import dataclasses
 import datetime
 import functools
-import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,31 +23,33 @@ from torchgrasp.app.cli.command import (
     positional,
 )
 from torchgrasp.app.cli.live import shoot_scene
-from torchgrasp.app.report.page import grasp_columns, grasp_rows, write_report
+from torchgrasp.app.cli.results import (
+    ENOUGH,
+    describe_run,
+    make_run,
+    read_true_mesh,
+    table_under,
+    write_run,
+)
+from torchgrasp.app.report.page import grasp_columns, grasp_rows
 from torchgrasp.app.report.recording import import_rerun, write_recording
 from torchgrasp.app.report.run_data import Run, verdict
-from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.pose import find_plausible
-from torchgrasp.data.shipped import DATA, find_view, list_objects, load_object
+from torchgrasp.data.shipped import find_view
 from torchgrasp.evaluation.drag_trial import lift_from_edge
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.export import save_surface
-from torchgrasp.export.play import stand
-from torchgrasp.files import format_columns, format_line, sha256
+from torchgrasp.files import format_columns, format_line
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Count, Seed
 from torchgrasp.geometry.frames import rigid
 from torchgrasp.geometry.linalg import norm
-from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane, as_plane, move
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.clearing import order_to_clear
 from torchgrasp.planner.drag_plan import DragPlan
-from torchgrasp.planner.drag_text import KEY
 from torchgrasp.planner.edge import EdgePlan, plan_edge_grasps
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.graspable import judge_things
@@ -59,9 +61,6 @@ from torchgrasp.scene.image import is_scene, read_arrays
 from torchgrasp.scene.masks import label_again
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.second_view import NextView, next_view
-from torchgrasp.shape.surface import extract_surface
-from torchgrasp.success.reasons import explain_success
 from torchgrasp.success.task import GraspTask, TaskName
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps, PointCloud, format_success
@@ -71,8 +70,6 @@ Among = Literal["auto"] | None
 STAGES = ("shape", "plan", "certify", "query", "refine")
 """Stages of planning, as the planner reports them."""
 LEAST_BUDGET = 1e-3  # of --time-budget [s]
-ENOUGH = 0.9  # predicted success of an object that is easy enough: the others are not tried
-HELPS = 0.8  # share of the deviation that may remain after a second view that is worth telling
 DIGITS = 3  # decimals of a direction that is printed
 SHOWN = 5  # grasps that are printed
 OBJECT_WIDTHS = (-10, 7, -1)  # of the columns of a scene's objects
@@ -246,23 +243,16 @@ class Grasp(ForPrograms):
         file = inputs.without_exact_table(file, self.view.vertical)
         view = self.view.with_table_of(file)
         cloud = file.cloud
-        table = view.plane(file.cloud)
+        table = view.plane(cloud)
         if self.edge is not None:
             table = inputs.with_edge(table, self.edge)
         plane = as_plane(table)
-        spec = (ContactSpec.paper if self.mode == "paper" else ContactSpec)(
-            friction=self._friction, table=table
-        )
+        make_spec = ContactSpec.paper if self.mode == "paper" else ContactSpec
+        spec = make_spec(friction=self._friction, table=table)
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
         inputs.print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
-            check_mesh(cloud, true_mesh, "--mesh")
-            # the robot guesses the height of the table, which the true mesh tells
-            if plane is not None and view.table is None:
-                lowest = float((true_mesh.vertices @ plane.normal.numpy()).min())
-                plane = dataclasses.replace(plane, offset=lowest)
-            elif plane is not None:
-                check_stand(true_mesh, plane, "--mesh")
+            plane = check_truth(cloud, true_mesh, plane, given=view.table is not None)
         progress = StageProgress(
             *["fingers"] * (among is not None),
             *STAGES,
@@ -271,10 +261,7 @@ class Grasp(ForPrograms):
             "report",
         )
         with progress.bar, inputs.holding("--out", out):
-            origin = "no table" if table is None else inputs.describe_table(table)
-            origin += " (lowest point)" * (table is not None and view.table is None)
-            camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
-            progress.end("cloud", f"{len(cloud)} points, {camera}, {origin}")
+            progress.end("cloud", describe_seen(cloud, table, given=view.table is not None))
             grasps, explanation = self._plan(cloud, hand, spec, among, progress)
             name = inputs.object_name(path if mesh is None else mesh)
             shape = progress.values["shape"]
@@ -287,7 +274,18 @@ class Grasp(ForPrograms):
                 shape = edge.shape
                 progress.values["plan"] = None  # the contacts where the object stood
                 cloud = move(cloud, rigid(torch.eye(3), drag.displacement).to(cloud.points))
-            run = self._gather(name, path, cloud, hand, spec, grasps, shape, progress, explanation)
+            run = make_run(
+                name,
+                path,
+                cloud,
+                hand,
+                spec,
+                grasps,
+                shape,
+                self._task["task"],
+                explanation=explanation,
+                **self._recorded(progress),
+            )
             if self.close and true_mesh is not None and len(run.executable):
                 run = self._close(run, edge, true_mesh, parts, plane, progress)
             progress.end("report", self._write(out, run))
@@ -295,9 +293,8 @@ class Grasp(ForPrograms):
             print(f"\ndrag first  {describe_drag(drag, run.hand)}")
         executable = print_grasps(run)
         answer(describe_run(run, out))
-        return (
-            0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
-        )
+        good = run.closure is not None and run.closure.held if self.close else executable
+        return 0 if good else 1
 
     def _plan(
         self,
@@ -384,43 +381,15 @@ class Grasp(ForPrograms):
         stages = tuple(progress.stages)
         return dataclasses.replace(run, stages=stages, mesh=mesh, closure=closure)
 
-    def _gather(
-        self,
-        name: str,
-        path: Path,
-        cloud: PointCloud,
-        hand: Hand,
-        spec: ContactSpec,
-        grasps: Grasps,
-        shape: ShapeGP,
-        progress: StageProgress,
-        explanation: Explanation | None,
-        scene: Scene | None = None,
-    ) -> Run:
-        """Return the run, with what lowers the success of its best executable grasp most."""
-        hand = hand_of(grasps, hand)
-        costs = [
-            cost.sentence
-            for best in grasps[grasps.status == Status.OK][:1]
-            for cost in explain_success(best, hand, shape, self._task["task"])
-        ]
-        return Run(
-            name,
-            path,
-            cloud,
-            hand,
-            spec,
-            extract_surface(shape),
-            grasps,
-            tuple(progress.stages),
-            progress.values.get("plan"),
-            scene=scene,
-            explanation=explanation,
-            costs=tuple(costs),
-            look=find_look(shape, grasps, spec),
-            command=command_line(),
-            date=datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
-        )
+    def _recorded(self, progress: StageProgress) -> dict[str, Any]:
+        """Return what `Run` holds of the course of the command."""
+        now = datetime.datetime.now(datetime.timezone.utc)
+        return {
+            "stages": tuple(progress.stages),
+            "plan": progress.values.get("plan"),
+            "command": command_line(),
+            "date": now.strftime("%Y-%m-%d %H:%M UTC"),
+        }
 
     @functools.cached_property
     def _friction(self) -> float | Distribution:
@@ -462,24 +431,7 @@ class Grasp(ForPrograms):
         return the exit code.
         """
         spec = ContactSpec(friction=self._friction)
-        choice = self.point if self.label is None else self.label
-        names = {
-            name: f"CLOUD: {name}"
-            for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")
-        }
-        names |= {"path": "CLOUD", "points": "CLOUD", "target": "--label", "point": "--point"}
-        options = {"table": "--table", "up": "--up"}
-        with naming(**names):
-            arrays = read_arrays(path)
-        found = "table" in arrays
-        with naming(**names if found else names | options):
-            # a table that is given is not searched first
-            scene = scene_of(arrays, self.view.given_table, self.view.vertical)
-        with naming(**options, target="--label", point="--point"):
-            # the shot of a live camera is on the table of the options
-            if found and not self.realsense:
-                scene = self._with_table(scene, choice is not None)
-            scene = scene if choice is None else scene.select(choice)
+        scene = self._read_scene(path)
         progress = StageProgress("scene", *["fingers"] * (among is not None), *STAGES, "report")
         with progress.bar, inputs.holding("--out", out):
             progress.end(
@@ -509,26 +461,54 @@ class Grasp(ForPrograms):
             spec = dataclasses.replace(spec, table=scene.table)
             cloud = take_target(scene, self.seed)
             name = f"object {scene.target}"
-            run = self._gather(
-                name, path, cloud, hand, spec, grasps, shape, progress, explanation, scene
+            run = make_run(
+                name,
+                path,
+                cloud,
+                hand,
+                spec,
+                grasps,
+                shape,
+                self._task["task"],
+                explanation=explanation,
+                scene=scene,
+                **self._recorded(progress),
             )
             progress.end("report", self._write(out, run))
             clear = ()
-            words = ""
             if explanation is not None:
                 options = {"fingers": among, "mode": self.mode, **self._task}
                 plan = functools.partial(
                     plan_grasps, hand=hand, spec=spec, seed=self.seed, **options
                 )
                 clear = order_to_clear(scene, plan, self.starts)
-                words = ", then ".join(f"object {label}" for label in clear)
-                progress.end("clear", words or "no object that is in the way")
+                progress.end("clear", name_in_order(clear) or "no object that is in the way")
         executable = print_grasps(run)
         if clear:
-            print(f"take away first  {words}; object {scene.target} then has a grasp")
+            first = name_in_order(clear)
+            print(f"take away first  {first}; object {scene.target} then has a grasp")
         of_scene = {"label": scene.target, "clear": list(clear), "doubts": list(scene.doubts)}
         answer(describe_run(run, out) | of_scene)
         return 0 if executable else 1
+
+    def _read_scene(self, path: Path) -> Scene:
+        """Return the scene of a file with the table of --table or --up, and the chosen target."""
+        choice = self.point if self.label is None else self.label
+        arrays_of_scene = ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")
+        names = {name: f"CLOUD: {name}" for name in arrays_of_scene}
+        names |= {"path": "CLOUD", "points": "CLOUD", "target": "--label", "point": "--point"}
+        options = {"table": "--table", "up": "--up"}
+        with naming(**names):
+            arrays = read_arrays(path)
+        found = "table" in arrays
+        with naming(**names if found else names | options):
+            # a table that is given is not searched first
+            scene = scene_of(arrays, self.view.given_table, self.view.vertical)
+        with naming(**options, target="--label", point="--point"):
+            # the shot of a live camera is on the table of the options
+            if found and not self.realsense:
+                scene = self._with_table(scene, choice is not None)
+            return scene if choice is None else scene.select(choice)
 
     def _with_table(self, scene: Scene, chosen: bool) -> Scene:
         """Return the scene with the table of --table or --up; raise `BadArgument` if the target is
@@ -572,21 +552,16 @@ class Grasp(ForPrograms):
         """Write grasps and estimated surface of a run, its HTML pages unless --no-report, and its
         recording.
         """
-        paths = [out / "grasps.safetensors"]
-        run.grasps.save(paths[0])
-        if len(run.executable):
-            paths.append(save_surface(stand(run.surface, run.grasps.table), out / "surface.ply"))
-        if not self.no_report:
-            paths += [write_report(out / "report.html", run, VIEW), write_viewer(out / VIEW, run)]
+        paths = write_run(out, run, pages=not self.no_report)
         if self.rerun:
             paths.append(write_recording(out / "run.rrd", run))
         return ", ".join(map(str, paths))
 
     def _find_easiest(
         self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: StageProgress
-    ):
+    ) -> tuple[Scene, Grasps, ShapeGP] | None:
         """Plan for the objects of a scene until one is easy; return the scene with it as target,
-        grasps and shape.
+        grasps and shape, or None if no object has a grasp.
         """
         options = {"fingers": among, "enough": ENOUGH, **self._task}
         plan = plan_scene(scene, hand, spec, self.starts, self.seed, **options)
@@ -598,15 +573,37 @@ class Grasp(ForPrograms):
             likely = "-" if thing.grasps is None else format_success(thing.success)
             cells = f"object {thing.label}", likely, text
             print(format_line(cells, OBJECT_WIDTHS), flush=True)
-        progress.end(
-            "objects", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp"
-        )
+        graspable = sum(thing.grasps is not None for thing in plan.things)
+        progress.end("objects", f"{graspable} with a grasp")
         if plan.best is None or plan.best.grasps is None or plan.best.shape is None:
-            help = "With --label or --point, changes that would help are tried for one of them."
-            return print(
-                f"The {hand.name} hand has no executable grasp of any object in the scene.\n{help}"
-            )
+            print(f"The {hand.name} hand has no executable grasp of any object in the scene.")
+            print("With --label or --point, changes that would help are tried for one of them.")
+            return None
         return scene.select(plan.best.label), plan.best.grasps, plan.best.shape
+
+
+def check_truth(
+    cloud: PointCloud, mesh: "trimesh.Trimesh", table: Plane | None, given: bool
+) -> Plane | None:
+    """Return the table under the true mesh [m], which is the `table` if that is `given`.
+
+    Raises `BadArgument` for a mesh that contradicts the cloud, or does not stand on a given table.
+    """
+    check_mesh(cloud, mesh, "--mesh")
+    if not given:
+        return table_under(mesh, table)
+    if table is not None:
+        check_stand(mesh, table, "--mesh")
+    return table
+
+
+def describe_seen(cloud: PointCloud, table: Plane | float | None, given: bool) -> str:
+    """Return a text on a cloud and its table, which is at the lowest point if it is not `given`."""
+    camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
+    place = "no table"
+    if table is not None:
+        place = f"{inputs.describe_table(table)}{'' if given else ' (lowest point)'}"
+    return f"{len(cloud)} points, {camera}, {place}"
 
 
 def print_grasps(run: Run) -> bool:
@@ -621,6 +618,11 @@ def print_grasps(run: Run) -> bool:
         print(f"look next  from {run.look.sentence}")
     print(verdict(run))
     return len(run.executable) > 0
+
+
+def name_in_order(labels: Sequence[int]) -> str:
+    """Return the names of objects of a scene in the order in which they are taken away."""
+    return ", then ".join(f"object {label}" for label in labels)
 
 
 def rank_best(grasps: Grasps) -> float:
@@ -651,68 +653,3 @@ def describe_drag(drag: DragPlan, hand: Hand) -> str:
         f"{fingers} press on the object from above with {drag.force:.1f} N, "
         f"and drag it {1e3 * length:.0f} mm along ({along})"
     )
-
-
-def find_look(shape: ShapeGP, grasps: Grasps, spec: ContactSpec) -> NextView | None:
-    """Return from where a second view would help.
-
-    It is None if the best grasp is likely enough, or if no view would tell much.
-    """
-    best = grasps[grasps.status == Status.OK][:1]
-    if len(best) and float(best.success[0]) >= ENOUGH:
-        return None
-    view = next_view(shape, grasps, table=spec.plane)
-    return view if view.after < HELPS * view.before else None
-
-
-def describe_run(run: Run, out: Path) -> dict[str, Any]:
-    """Return the result of a run for JSON, with units in the names.
-
-    `best` is the best executable grasp, or None; `file`, in the folder `out`, holds all grasps.
-    """
-    best = None
-    for grasp in run.executable[:1]:
-        joints = run.hand.expand(grasp.joints[0])
-        best = {
-            "success": float(grasp.success[0]),
-            "joints_rad": {name: float(q) for name, q in joints.items()},
-            "obj_from_hand_m": grasp.obj_from_hand[0].tolist(),
-            "fingers": list(run.hand.finger_names),
-            "contacts_m": grasp.contacts.points[0].tolist(),
-        }
-    return {
-        "object": run.object_name,
-        "hand": run.hand.name,
-        "grasps": len(run.grasps),
-        "executable": len(run.executable),
-        "held": None if run.closure is None else run.closure.held,
-        "verdict": verdict(run),
-        "best": best,
-        "drag": json.loads(run.grasps.meta.get(KEY, "null")),
-        "look_next": None if run.look is None else describe_look(run.look),
-        "file": str(out / "grasps.safetensors"),
-    }
-
-
-def describe_look(view: NextView) -> dict[str, Any]:
-    """Return a camera for a second view for JSON, with units in the names."""
-    return {
-        "obj_from_camera_m": view.camera_pose.tolist(),
-        "turn_deg": view.turn if view.turn == view.turn else None,
-        "std_before_m": view.before,
-        "std_after_m": view.after,
-    }
-
-
-def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
-    """Return the closed mesh [m] of --mesh and, for a shipped object, its convex parts.
-
-    The parts are None for any other mesh.
-    """
-    with naming(path="--mesh", mesh="--mesh"):
-        mesh = read_mesh(path)
-        digest = sha256(path)
-    for name in list_objects():
-        if sha256(DATA / name / "mesh.ply") == digest:
-            return mesh, load_object(name).parts
-    return mesh, None

@@ -4,6 +4,7 @@ hand that grasps.
 
 import dataclasses
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -48,8 +49,14 @@ from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.request import finger_sets
 from torchgrasp.posture_model.dataset import write_samples
-from torchgrasp.posture_model.mixture import mixture_path
-from torchgrasp.posture_model.sample import SampleSpec, Sampling, can_close, sample_configurations
+from torchgrasp.posture_model.mixture import GraspMixture, mixture_path
+from torchgrasp.posture_model.sample import (
+    HandSamples,
+    SampleSpec,
+    Sampling,
+    can_close,
+    sample_configurations,
+)
 from torchgrasp.posture_model.score import evaluate_mixture, growing_bic
 from torchgrasp.posture_model.training import FitProgress, fit_mixture
 from torchgrasp.testing import check_hand, find_faults, most_met
@@ -128,11 +135,18 @@ class HandNew(Command):
         urdf, meshes, out = locate_urdf(self.urdf, self.meshes, self.out)
         folder = urdf.parent if out is None else out
         check_folder(folder)
-        clean = (
-            "hand.urdf" if (folder / "hand.urdf").resolve() != urdf.resolve() else "hand_clean.urdf"
+        # the published URDF is not overwritten
+        taken = (folder / "hand.urdf").resolve() == urdf.resolve()
+        clean = "hand_clean.urdf" if taken else "hand.urdf"
+        wish = Wish(
+            tips=self.tips,
+            name=self.name or "",
+            root=self.root,
+            meshes=meshes,
+            visual=self.visual,
+            tip_offset=self.tip_offset,
+            tip_radius=self.tip_radius,
         )
-        sensors = self.tip_offset, self.tip_radius
-        wish = Wish(self.tips, self.name or "", self.root, meshes, self.visual, *sensors)
         draft = new_hand(urdf, wish, self.seed, clean)
         texts: dict[str, str | bytes] = {"hand.toml": draft.toml, **draft.meshes}
         if draft.urdf or out is not None:
@@ -156,9 +170,12 @@ class HandNew(Command):
                 print(f"written: {folder / file}")
         if draft.meshes:
             print(f"written: {len(draft.meshes)} visual meshes for pictures")
-        place = (
-            folder if folder.is_absolute() else f"./{folder}"
-        )  # a plain name may be that of a shipped hand
+        return self._judge(folder)
+
+    def _judge(self, folder: Path) -> int:
+        """Check the written files, and print what to do next; return the exit code."""
+        # a plain name may be that of a shipped hand
+        place = folder if folder.is_absolute() else f"./{folder}"
         next_step = f"torchgrasp hand check {place}"
         hand = _checked(folder)
         if hand is None:
@@ -197,21 +214,13 @@ class HandCheck(ForPrograms):
         with make_bar(None, "step", desc="faults") as bar:
             faults = list_faults(self.hand, chosen)
             if faults:
-                print_faults(self.hand, chosen)
+                print_faults(faults)
                 answer({"faults": faults, "able": False, "sets": []})
                 return 2
             sound = check_hand(self.hand, chosen)
             check_folder(self.out.parent)
             joints = random_joints(sound, TRIAL.postures)
-            bar.write(f"{describe(sound, joints)}\n{describe_sets(sound)}")
-            urdf = read_urdf(sound.urdf_path)
-            for warning in find_unusual(urdf, shape_points(urdf, urdf.path.parent)):
-                bar.write(f"warning: {warning}")
-            model = find_hand(self.hand) / "mixture.safetensors"
-            missing = (
-                f"none; only the modes of the paper need one: torchgrasp hand train {self.hand}"
-            )
-            bar.write(f"learned model: {model if model.exists() else missing}")
+            self._describe(sound, joints, bar)
             hands = finger_sets(sound, "auto" if self.fingers == "auto" else None)
             bar.total = 1 + 2 * len(hands)
             bar.update()
@@ -230,33 +239,44 @@ class HandCheck(ForPrograms):
             abilities = [hand_abilities(one, TRIAL.postures) for one in hands]
         for known in abilities:
             print(describe_abilities(known))
-        file = self.out.with_name(ABILITIES)
-        write_file(file, format_json({"sets": [known.content() for known in abilities]}))
-        print(f"abilities: {file}")
         sets = [known.content() for known in abilities]
+        file = self.out.with_name(ABILITIES)
+        write_file(file, format_json({"sets": sets}))
+        print(f"abilities: {file}")
         answer({"faults": [], "able": able, "picture": str(self.out), "sets": sets})
         if able:
             print("the hand can grasp")
         return 0 if able else 1
 
+    def _describe(self, hand: Hand, joints: torch.Tensor, bar: tqdm) -> None:
+        """Write what a hand without faults is above the progress `bar`.
+
+        `joints` (n, h) are n random postures of the h actuated joints [rad].
+        """
+        bar.write(f"{describe(hand, joints)}\n{describe_sets(hand)}")
+        for warning in list_unusual(hand):
+            bar.write(f"warning: {warning}")
+        model = find_hand(self.hand) / "mixture.safetensors"
+        missing = f"none; only the modes of the paper need one: torchgrasp hand train {self.hand}"
+        bar.write(f"learned model: {model if model.exists() else missing}")
+
 
 def _checked(folder: Path) -> Hand | None:
-    """Print every fault of the hand in a folder; return the hand, or None if there is any."""
-    if print_faults(folder):
-        return None
-    try:
-        return check_hand(folder)
-    except GraspError as error:
-        print(f"wrong: {' '.join(str(error).split())}")
-        return None
+    """Return the hand in a folder; if it has faults, print them and return None."""
+    faults = list_faults(folder)
+    if not faults:
+        try:
+            return check_hand(folder)
+        except GraspError as error:
+            faults = (" ".join(str(error).split()),)
+    print_faults(faults)
+    return None
 
 
-def print_faults(hand: str | Path, fingers: str = "default") -> bool:
-    """Print every fault of a hand that `list_faults` finds; return whether there is any."""
-    faults = list_faults(hand, fingers)
+def print_faults(faults: Iterable[str]) -> None:
+    """Print faults of a hand, a line for each."""
     for sentence in faults:
         print(f"wrong: {sentence}")
-    return bool(faults)
 
 
 def list_faults(hand: str | Path, fingers: str = "default") -> tuple[str, ...]:
@@ -275,6 +295,12 @@ def list_faults(hand: str | Path, fingers: str = "default") -> tuple[str, ...]:
             raise
         faults = [error]
     return tuple(dict.fromkeys(" ".join(str(fault).split()) for fault in faults))
+
+
+def list_unusual(hand: Hand) -> list[str]:
+    """Return a sentence for each kind of number of a hand's URDF that no hand has."""
+    urdf = read_urdf(hand.urdf_path)
+    return find_unusual(urdf, shape_points(urdf, urdf.path.parent))
 
 
 def describe_sets(hand: Hand) -> str:
@@ -453,22 +479,7 @@ class HandTrain(Command):
             print(f"{hand.name}: {len(samples)} postures in {time.perf_counter() - begin:.0f} s")
             begin = time.perf_counter()
             components = self.components or choose_components(hand, self.seed, self.workers)
-            with make_bar(None, "step", desc="EM") as bar, naming(path="--checkpoint"):
-
-                def show(progress: FitProgress) -> None:
-                    bar.update()
-                    bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
-
-                mixture = fit_mixture(
-                    samples[: self.n],
-                    components,
-                    self.seed,
-                    tolerance=TRAIN.tolerance,
-                    starts=TRAIN.starts,
-                    subset=TRAIN.subset * components,
-                    checkpoint=self.checkpoint,
-                    observer=show,
-                )
+            mixture = self._fit(samples[: self.n], components)
             meta = mixture.meta
             spent = time.perf_counter() - begin
             print(
@@ -486,6 +497,25 @@ class HandTrain(Command):
                 dataclasses.replace(mixture, meta=meta | score.meta()).save(out)
             print(f"written: {out}")
         return 0
+
+    def _fit(self, samples: HandSamples, components: int) -> GraspMixture:
+        """Return a mixture of Gaussians that is fitted to samples of postures."""
+        with make_bar(None, "step", desc="EM") as bar, naming(path="--checkpoint"):
+
+            def show(progress: FitProgress) -> None:
+                bar.update()
+                bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
+
+            return fit_mixture(
+                samples,
+                components,
+                self.seed,
+                tolerance=TRAIN.tolerance,
+                starts=TRAIN.starts,
+                subset=TRAIN.subset * components,
+                checkpoint=self.checkpoint,
+                observer=show,
+            )
 
 
 def choose_components(hand: Hand, seed: int, workers: int) -> int:

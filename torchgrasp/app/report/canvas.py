@@ -1,21 +1,26 @@
-"""Common colours of all pictures, and a canvas that renders its triangles to pixels in NumPy,
-without OpenGL.
-"""
+"""Common colours of all pictures, and a canvas for the shapes of a picture."""
 
 import dataclasses
 import io
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
+from torchgrasp.app.report.raster import (
+    FULL,
+    Camera,
+    Color,
+    Direction,
+    Triangles,
+    concatenate,
+    render,
+)
 from torchgrasp.foundation.lazy import Image, ImageDraw, ImageFont, matplotlib, trimesh
 from torchgrasp.geometry.plane import Plane, as_plane
 
 Points = Float[np.ndarray, "n 3"]  # points [m], or colours in [0, 1]
-Color = tuple[float, float, float]  # red, green and blue in [0, 1]
-Direction = tuple[float, float, float]  # (x, y, z) of any length
 FINGERS = (
     "#2f6db5",
     "#23967f",
@@ -43,7 +48,6 @@ ALARM = "#c2452d"
 object was lost.
 """
 SIZE = (720, 576)  # width and height of a still [pixels]: twice its size on a page of three columns
-FULL = 255  # largest value of a colour part in a byte
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,36 +88,6 @@ class Framing:
 
 
 @dataclasses.dataclass(frozen=True)
-class RasterNumbers:
-    """Parameters of the rendering of triangles to pixels."""
-
-    samples: int = 2  # number of samples along each axis of a pixel; their mean gives smooth edges
-    opacity: float = 0.5  # opacity of transparent triangles, in [0, 1]
-    nearest: float = 1e-6  # least distance from the camera [m]; the scene is framed in front of it
-    thinnest: float = 1e-9  # twice the least area [pixels]: seen from its edge, a triangle is thin
-    # Triangles that share an edge both cover a centre within this distance [pixels] of it, so that
-    # no crack is left between them.
-    tie: float = 1e-6
-
-
-@dataclasses.dataclass(frozen=True)
-class Lamps:
-    """Numbers of two lamps fixed to the camera, chosen by eye.
-
-    Strengths are factors of a surface's colour; directions are (right, up, back).
-    """
-
-    ambient: float = 0.52  # brightness without the lamps
-    key_strength: float = 0.50  # brightness that the main lamp adds
-    fill_strength: float = 0.22  # brightness that the second lamp adds
-    shine_strength: float = 0.08  # white that the highlight of the main lamp adds
-    key: Direction = (-0.45, 0.65, 0.62)  # direction to the main lamp
-    fill: Direction = (0.70, 0.10, 0.60)  # direction to the second lamp
-    shininess: int = 40  # exponent: larger makes the highlight smaller
-    least_normal: float = 1e-12  # least length of a normal as a divisor: a face without area has 0
-
-
-@dataclasses.dataclass(frozen=True)
 class BarLayout:
     """Layout of a colour bar at the bottom of a picture [pixels]."""
 
@@ -128,43 +102,11 @@ class BarLayout:
 
 MARKS = MarkShapes()
 FRAMING = Framing()
-RASTER = RasterNumbers()
-LAMPS = Lamps()
 BAR = BarLayout()
 SMOOTH_BEND = 40.0  # faces that bend by less [degrees] look like one smooth surface
 STD_QUANTILE = 0.99  # of the standard deviations that a colour map spans: few outliers
 LEAST_STD = 1e-6  # least span of a colour map of standard deviations [m]
 PNG_LEVEL = 4  # of compression: higher is slower and hardly smaller
-
-
-class Triangles(NamedTuple):
-    """A set of t triangles, each with a normal and a colour at its three corners.
-
-    Attributes:
-        corners: positions of the corners [m].
-        normals: vectors across the surface at the corners, of any length and either sign.
-        colors: red, green and blue at the corners, in [0, 1].
-        lit: mask of the triangles that are shaded; the others keep their colours.
-    """
-
-    corners: Float[np.ndarray, "t 3 3"]
-    normals: Float[np.ndarray, "t 3 3"]
-    colors: Float[np.ndarray, "t 3 3"]
-    lit: Bool[np.ndarray, " t"]
-
-
-class Camera(NamedTuple):
-    """A pinhole camera.
-
-    Attributes:
-        position: place of its centre [m], in the frame of the shapes.
-        frame: unit vectors to the right, up and back of the camera, one in each row.
-        angle: vertical field of view [rad].
-    """
-
-    position: Float[np.ndarray, "3"]
-    frame: Float[np.ndarray, "3 3"]
-    angle: float
 
 
 class Canvas:
@@ -345,126 +287,6 @@ def sharp_normals(
     normals = np.empty((len(faces), 3, 3))
     normals[order] = smooth.vertex_normals[smooth.faces]
     return normals
-
-
-def concatenate(parts: list[Triangles]) -> Triangles:
-    """Join several sets of triangles, or none, into one set."""
-    empty = np.zeros((0, 3, 3))
-    none = Triangles(empty, empty, empty, np.zeros(0, dtype=bool))
-    return Triangles(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
-
-
-def render(
-    solid: Triangles,
-    transparent: Triangles,
-    camera: Camera,
-    size: tuple[int, int],
-    background: Color,
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pixels of a picture of opaque and transparent triangles.
-
-    They are shown as the `camera` sees them. Of the transparent triangles, only the nearest layer
-    is drawn over the opaque ones (`solid`). `size` is the width and height (w, h) [pixels];
-    `background` is red, green and blue in [0, 1].
-    """
-    samples = RASTER.samples
-    width = size[0] * samples
-    height = size[1] * samples
-    image = np.tile(np.array(background, dtype=np.float32), (height * width, 1))
-    near = np.zeros(height * width)
-    sample, inverse_distance, color = _cast(solid, camera, width, height)
-    image[sample] = color
-    near[sample] = inverse_distance
-    sample, inverse_distance, color = _cast(transparent, camera, width, height)
-    front = inverse_distance > near[sample]
-    image[sample[front]] += RASTER.opacity * (color[front] - image[sample[front]])
-    pixels = image.reshape(size[1], samples, size[0], samples, 3).mean((1, 3))
-    return (FULL * np.clip(pixels, 0.0, 1.0) + 0.5).astype(np.uint8)
-
-
-def _cast(
-    triangles: Triangles, camera: Camera, width: int, height: int
-) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]:
-    """Return indices of the samples that triangles cover, with inverse distance and colour of the
-    nearest one.
-    """
-    local = (triangles.corners - camera.position) @ camera.frame.T
-    near = 1.0 / np.maximum(-local[..., 2], RASTER.nearest)
-    focal = height / 2 / np.tan(camera.angle / 2)
-    x = width / 2 + focal * local[..., 0] * near
-    y = height / 2 - focal * local[..., 1] * near
-    # A value that is linear in space is, divided by its distance, linear on the screen:
-    # a x + b y + c.
-    values = np.concatenate([near[..., None], _shade(triangles, camera) * near[..., None]], -1)
-    screen = np.stack([x, y, np.ones_like(x)], -1)
-    seen = np.abs(np.linalg.det(screen)) > RASTER.thinnest
-    # weights of the corners, as functions of x, y and 1: (t, 3, 3)
-    weights = np.linalg.inv(screen[seen])
-    y = y[seen]
-    planes = weights @ values[seen]
-
-    # Sample centres lie at integers + 0.5; in each row a triangle covers those where no weight is
-    # negative.
-    owner, row = _ranges(*(_first_centre(end, height) for end in (y.min(1), y.max(1))))
-    slope = weights[owner, 0]
-    rest = weights[owner, 1] * (row + 0.5)[:, None] + weights[owner, 2]
-    zero = -rest / np.where(slope == 0.0, 1.0, slope)
-    begin = np.where(slope > 0.0, zero, -np.inf).max(1)
-    end = np.where(slope < 0.0, zero, np.inf).min(1)
-    span, column = _ranges(
-        _first_centre(begin - RASTER.tie, width), _first_centre(end + RASTER.tie, width)
-    )
-
-    flat = planes[owner, 1] * (row + 0.5)[:, None] + planes[owner, 2]  # b y + c
-    near = planes[owner, 0, 0][span] * (column + 0.5) + flat[span, 0]
-    sample = row[span] * width + column
-    nearest = np.zeros(height * width)
-    np.maximum.at(nearest, sample, near)
-    first = np.flatnonzero(near == nearest[sample])
-    span = span[first]
-    column = column[first]
-    near = near[first]
-    color = planes[owner[span], 0, 1:] * (column + 0.5)[:, None] + flat[span, 1:]
-    return sample[first], near, color / near[:, None]
-
-
-def _first_centre(place: np.ndarray, most: int) -> Int[np.ndarray, " n"]:
-    """Return the index of the first sample centre at or after each place, from 0 to `most`."""
-    return np.clip(np.ceil(place - 0.5), 0, most).astype(np.int64)
-
-
-def _ranges(
-    begin: np.ndarray, end: np.ndarray
-) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """List all integers in the ranges [begin, end): return the index of each one's range, and the
-    integers.
-    """
-    counts = np.maximum(end - begin, 0)
-    owner = np.repeat(np.arange(len(begin)), counts)
-    start = np.cumsum(counts) - counts
-    return owner, np.arange(len(owner)) - (start - begin)[owner]
-
-
-def _shade(triangles: Triangles, camera: Camera) -> Float[np.ndarray, "t 3 3"]:
-    """Return the colours of the corners, lit by two lamps fixed to the camera."""
-    key = np.array(LAMPS.key) / np.linalg.norm(LAMPS.key)
-    fill = np.array(LAMPS.fill) / np.linalg.norm(LAMPS.fill)
-    normal = triangles.normals @ camera.frame.T
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    normal = normal / np.maximum(length, LAMPS.least_normal)
-    # a triangle has no back: seen from there, its normals are reversed
-    normal = np.where(normal[..., 2].sum(1)[:, None, None] < 0.0, -normal, normal)
-    light = (
-        LAMPS.ambient
-        + LAMPS.key_strength * np.maximum(normal @ key, 0.0)
-        + LAMPS.fill_strength * np.maximum(normal @ fill, 0.0)
-    )
-    half = key + np.array([0.0, 0.0, 1.0])
-    mirrored = np.maximum(normal @ (half / np.linalg.norm(half)), 0.0)
-    shine = LAMPS.shine_strength * mirrored**LAMPS.shininess
-    lit = triangles.lit[:, None]
-    matt = triangles.colors * np.where(lit, light, 1.0)[..., None]
-    return matt + np.where(lit, shine, 0.0)[..., None]
 
 
 def rgb(color: str) -> Color:

@@ -9,14 +9,19 @@ import numpy as np
 import torch
 
 from torchgrasp.app.report import canvas as paint
-from torchgrasp.app.report.canvas import Direction
-from torchgrasp.app.report.run_data import explain_loss, first_touches, mass_centre, moments_of
-from torchgrasp.app.report.solids import solids_from_hand
-from torchgrasp.app.report.stills import add_solids, to_array
+from torchgrasp.app.report.closing_moments import (
+    Moment,
+    explain_loss,
+    first_touches,
+    mass_centre,
+    moments_of,
+)
+from torchgrasp.app.report.closing_pictures import draw_ticks, finite_ticks
+from torchgrasp.app.report.raster import Direction
+from torchgrasp.app.report.stills import to_array
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
-from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.geometry.frames import apply, real
+from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
@@ -45,7 +50,6 @@ class FilmLayout:
     right: float = 0.985  # right end of the plots, as a share of the width
     letter_rise: int = 30  # height of a letter above the first plot [points]
     touch: int = 12  # size of the mark at a finger's first touch [points]
-    far: float = 0.25  # an object this far from its first place [m] is lost, and is not framed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,22 +102,20 @@ def draw_film(
 
     moments = moments_of(closure, mass_centre(mesh), hand.tips.names)
     plots = _list_plots(mesh, hand, closure)
-    time = to_array(closure.time)
-    count = len(moments)
     heights = [FILM.tall_plot if title.endswith(":") else FILM.plot for title, *_ in plots]
     height = FILM.still + sum(heights) + FILM.plot_gap * len(plots) + FILM.bottom
     size = FILM.width / FILM.dpi, height / FILM.dpi
     figure = Figure(size, dpi=FILM.dpi, facecolor=paint.PAPER)
-    stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction, edge)
-    font = FILM.font if count < FILM.many else FILM.small_font
-    bottom = 1 - FILM.still / height
-    shown = (FILM.still - FILM.title) / height
-    for k, (still, moment) in enumerate(zip(stills, moments, strict=True)):
-        axis = figure.add_axes((k / count, bottom, 1 / count, shown))
-        axis.imshow(still, aspect="auto")
-        axis.set_axis_off()
-        title = f"{LETTERS[k]}  {float(closure.time[moment.tick]):.2f} s  {moment.name}"
-        axis.set_title(title, loc="left", x=FILM.title_left, color=moment.color, fontsize=font)
+
+    # of a simulation that diverged, the last state before
+    finite = finite_ticks(closure)
+    ticks = [int(finite[finite <= moment.tick][-1]) for moment in moments]
+    table = dataclasses.replace(Plane.horizontal(0.0), edge=edge)
+    count = len(moments)
+    still_size = FILM.width // count, FILM.still - FILM.title
+    stills = draw_ticks(mesh, hand, closure, ticks, range(count), direction, table, still_size)
+    times = [float(closure.time[moment.tick]) for moment in moments]
+    _add_stills(figure, height, list(stills), moments, times)
 
     figure.subplots_adjust(
         FILM.left,
@@ -123,6 +125,7 @@ def draw_film(
         hspace=FILM.plot_gap / float(np.mean(heights)),
     )
     axes = figure.subplots(len(plots), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    time = to_array(closure.time)
     for axis, plot in zip(axes, plots, strict=True):
         _draw_plot(axis, time, *plot)
     for finger, tick in zip(closure.contact_order, first_touches(closure), strict=True):
@@ -130,15 +133,44 @@ def draw_film(
         # in front of the axis, which is drawn in layer 2
         look = {"color": color, "markersize": FILM.touch, "clip_on": False, "zorder": 3}
         axes[0].plot(time[tick], 0.0, "^", **look)
-    for letter, moment in zip(LETTERS, moments, strict=False):
-        at = float(closure.time[moment.tick])
+    _mark_moments(axes, moments, times)
+    axes[-1].set_xlabel("time [s]", fontsize=PLOTS.font, color=paint.INK)
+    return paint.encode_figure(figure)
+
+
+def _add_stills(
+    figure: Any,
+    height: int,
+    stills: list[np.ndarray],
+    moments: list[Moment],
+    times: list[float],
+) -> None:
+    """Add stills with their titles in a row at the top of a figure of a height [pixels].
+
+    `times` [s] are those of the `moments`.
+    """
+    count = len(stills)
+    font = FILM.font if count < FILM.many else FILM.small_font
+    bottom = 1 - FILM.still / height
+    shown = (FILM.still - FILM.title) / height
+    for k, (still, moment, time) in enumerate(zip(stills, moments, times, strict=True)):
+        axis = figure.add_axes((k / count, bottom, 1 / count, shown))
+        axis.imshow(still, aspect="auto")
+        axis.set_axis_off()
+        title = f"{LETTERS[k]}  {time:.2f} s  {moment.name}"
+        axis.set_title(title, loc="left", x=FILM.title_left, color=moment.color, fontsize=font)
+
+
+def _mark_moments(axes: Any, moments: list[Moment], times: list[float]) -> None:
+    """Draw a line through all plots at the time [s] of each moment, with a letter above it."""
+    for letter, moment, time in zip(LETTERS, moments, times, strict=False):
         color = moment.color
         wide = 2 if color == paint.ALARM else 1
         for axis in axes:
-            axis.axvline(at, color=color, linewidth=wide, clip_on=False)
+            axis.axvline(time, color=color, linewidth=wide, clip_on=False)
         axes[0].annotate(
             letter,
-            (at, 1.0),
+            (time, 1.0),
             xycoords=axes[0].get_xaxis_transform(),
             xytext=(0, FILM.letter_rise),
             textcoords="offset points",
@@ -146,8 +178,6 @@ def draw_film(
             color=color,
             fontsize=FILM.font,
         )
-    axes[-1].set_xlabel("time [s]", fontsize=PLOTS.font, color=paint.INK)
-    return paint.encode_figure(figure)
 
 
 def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> str:
@@ -167,43 +197,6 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
     again = f" The hand closed {times(attempts)}." if attempts > 1 else ""
     end = (lost or "The object was held.") + on_its_way + again
     return f"In the order of touch: {order}. {end}"
-
-
-def _draw_stills(
-    mesh: "trimesh.Trimesh",
-    hand: Hand,
-    closure: ClosureResult,
-    ticks: list[int],
-    direction: Direction,
-    edge: Plane | None,
-) -> list[np.ndarray]:
-    """Return pictures of the hand and the object at the given ticks, all at the same scale."""
-    known = closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1)
-    finite = flatnonzero(known)
-    # of a simulation that diverged, the last state before
-    at = torch.stack([finite[finite <= tick][-1] for tick in ticks])
-    vertices = real(np.array(mesh.vertices))
-    faces = np.asarray(mesh.faces)
-    places = to_array(apply(closure.object_pose[at].double(), vertices))
-    hands = [
-        solids_from_hand(hand, closure.joints[t], closure.joint_names, closure.hand_pose[t])
-        for t in at
-    ]
-    height = float(apply(closure.object_pose[0].double(), vertices)[:, 2].min())
-    table = dataclasses.replace(Plane.horizontal(height), edge=edge)
-    near = [x for x in places if np.abs(x - places[0]).mean(0).max() < FILM.far]
-    seen = np.concatenate([*near, *(s.vertices for solids in hands for s in solids)])
-    size = FILM.width // len(ticks), FILM.still - FILM.title
-    # one camera for all pictures: the lift is seen
-    camera = paint.frame_camera(seen, direction, size=size)
-    pictures = []
-    for place, solids in zip(places, hands, strict=True):
-        canvas = paint.Canvas()
-        canvas.add_table(seen, table, [(place, faces), *((s.vertices, s.faces) for s in solids)])
-        canvas.add_mesh(place, faces, paint.OBJECT)
-        add_solids(canvas, solids)
-        pictures.append(canvas.render(camera, size))
-    return pictures
 
 
 def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[Any]) -> None:

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.app.report.canvas import FULL, OBJECT, color_std, rgb
+from torchgrasp.app.report.canvas import OBJECT, color_std, rgb
+from torchgrasp.app.report.raster import FULL
 from torchgrasp.app.report.solids import link_poses, solids_by_link
 from torchgrasp.app.report.stills import mesh_arrays, to_array
 from torchgrasp.cloud.agreement import check_contacts

@@ -14,18 +14,16 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from torchgrasp.app.report import canvas as paint
-from torchgrasp.app.report.canvas import Direction
-from torchgrasp.app.report.solids import link_poses, solids_of_links
-from torchgrasp.app.report.stills import add_solids, facing, to_array
+from torchgrasp.app.report.closing_pictures import draw_ticks, finite_ticks
+from torchgrasp.app.report.raster import Direction
+from torchgrasp.app.report.stills import facing
 from torchgrasp.control.reference import check_single
 from torchgrasp.files import write_file
-from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError
 from torchgrasp.foundation.lazy import Image, trimesh
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.frames import apply, inverse, real, rotate
+from torchgrasp.geometry.frames import inverse, real
 from torchgrasp.geometry.plane import as_plane, move, upright_frame, upright_table
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosureResult
@@ -41,7 +39,6 @@ class MovieLayout:
 
     size: tuple[int, int] = (560, 448)  # width and height [pixels]; even, as H.264 needs
     longest: float = 60.0  # longest closing that is filmed [s]
-    near: float = 0.25  # an object this far from its first place [m] is lost, and is not framed
     colors: int = 256  # most colours of a GIF
     samples: int = 12  # pictures from which the colours of a GIF are taken
     tick: float = 0.01  # unit of the times in a GIF [s]
@@ -134,9 +131,7 @@ def find_ffmpeg() -> str:
 
 def _ticks(closure: ClosureResult, rate: int) -> list[int]:
     """Return the control ticks of the pictures; those of a diverged simulation are left out."""
-    known = closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1)
-    known &= closure.hand_pose.isfinite().all(-1).all(-1)
-    finite = flatnonzero(known)
+    finite = finite_ticks(closure)
     times = closure.time[finite].double()
     first = float(times[0])
     wanted = first + torch.arange(int((float(times[-1]) - first) * rate) + 1) / rate
@@ -155,47 +150,22 @@ def _draw(
     direction: Direction | None,
     ticks: list[int],
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Yield the pictures at some ticks."""
-    # each corner of each face has its own normal, which is computed once
-    given = np.asarray(mesh.vertices)
-    corners_of = np.asarray(mesh.faces)
-    vertices = real(given[corners_of].reshape(-1, 3))
-    normals = real(paint.sharp_normals(given, corners_of).reshape(-1, 3))
-    faces = np.arange(len(vertices)).reshape(-1, 3)
-    level = torch.eye(4, dtype=torch.float64)
+    """Return the pictures at some ticks."""
+    obj_from_level = torch.eye(4, dtype=torch.float64)
     if grasp.table is not None:
-        level = inverse(upright_frame(vertices, None, grasp.table))
-    where = facing(move(grasp.to(torch.float64), level)) if direction is None else direction
-    object_pose = level @ closure.object_pose[ticks].double()
-    places = to_array(apply(object_pose, vertices))  # (n, v, 3)
-    bends = to_array(rotate(object_pose, normals))
-    hand_pose = level @ closure.hand_pose[ticks].double()
-    poses = link_poses(hand, closure.joints[ticks], closure.joint_names, hand_pose)
-    solids = solids_of_links(hand)
-    turned = to_array(poses)  # (n, l, 4, 4)
-    # one camera for all pictures sees the hand at both ends of its way, and the object's place
-    corners = [x for x in places if np.abs(x - places[0]).mean(0).max() < MOVIE.near]
-    for k in (0, len(ticks) // 2, -1):
-        for solid in solids:
-            pose = turned[k, solid.link]
-            corners.append(solid.vertices @ pose[:3, :3].T + pose[:3, 3])
-    seen = np.concatenate(corners)
-    table = as_plane(upright_table(grasp.table, inverse(level)))
-    if table is not None:  # under the true object
-        table = dataclasses.replace(table, offset=float(places[0][:, 2].min()))
-    camera = paint.frame_camera(seen, where, size=MOVIE.size)
-    for place, bend, frames in zip(places, bends, turned, strict=True):
-        canvas = paint.Canvas()
-        moved = []
-        for solid in solids:
-            turn = frames[solid.link, :3, :3].T
-            corner = solid.vertices @ turn + frames[solid.link, :3, 3]
-            moved.append(solid._replace(vertices=corner, normals=solid.normals @ turn))
-        shadows = [(place, faces), *((s.vertices, s.faces) for s in moved)]
-        canvas.add_table(seen, table, shadows)
-        canvas.add_mesh(place, faces, paint.OBJECT, bend)
-        add_solids(canvas, moved)
-        yield canvas.render(camera, MOVIE.size)
+        obj_from_level = upright_frame(real(mesh.triangles.reshape(-1, 3)), None, grasp.table)
+    level_from_obj = inverse(obj_from_level)
+    level = dataclasses.replace(
+        closure,
+        object_pose=level_from_obj @ closure.object_pose.double(),
+        hand_pose=level_from_obj @ closure.hand_pose.double(),
+    )
+    if direction is None:
+        direction = facing(move(grasp.to(torch.float64), level_from_obj))
+    table = as_plane(upright_table(grasp.table, obj_from_level))
+    # the hand is seen at both ends of its way
+    framed = 0, len(ticks) // 2, -1
+    return draw_ticks(mesh, hand, level, ticks, framed, direction, table, MOVIE.size)
 
 
 def _encode_gif(pictures: list[UInt8[np.ndarray, "h w 3"]], rate: int) -> bytes:

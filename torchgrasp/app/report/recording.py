@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.app.report.canvas import FINGERS, FULL, OBJECT, color_std, rgb
-from torchgrasp.app.report.run_data import Run, mass_centre, moments_of
+from torchgrasp.app.report.canvas import FINGERS, OBJECT, color_std, rgb
+from torchgrasp.app.report.closing_moments import mass_centre, moments_of
+from torchgrasp.app.report.raster import FULL
+from torchgrasp.app.report.run_data import Run
 from torchgrasp.app.report.solids import link_poses, solids_by_link
 from torchgrasp.app.report.stills import mesh_arrays, to_array
 from torchgrasp.app.report.viewer import POSTURES, pose_postures

@@ -3,12 +3,14 @@
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from torchgrasp.app.report.canvas import FULL, GRID, INK, OBJECTS, PAPER, encode_png, rgb
+from torchgrasp.app.report.canvas import GRID, INK, OBJECTS, PAPER, encode_png, rgb
+from torchgrasp.app.report.raster import FULL
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.lazy import Image, ImageDraw, ImageFont, ndimage
@@ -213,9 +215,8 @@ def _rim(labels: np.ndarray, width: int) -> Bool[np.ndarray, "h w"]:
     return ndimage.maximum_filter(whole, width) != ndimage.minimum_filter(whole, width)
 
 
-def _number(picture: object, labels: Int[np.ndarray, "h w"], scale: float) -> None:
+def _number(picture: Any, labels: Int[np.ndarray, "h w"], scale: float) -> None:
     """Write the label of each object into the picture, at the object's widest place."""
-    assert isinstance(picture, Image.Image)
     pen = ImageDraw.Draw(picture)
     for label in np.unique(labels[labels > 0]).tolist():
         row, column = np.nonzero(labels == label)
@@ -231,11 +232,10 @@ def _number(picture: object, labels: Int[np.ndarray, "h w"], scale: float) -> No
         pen.text(place, str(label), "white", font, anchor="mm", **rim)
 
 
-def _with_legend(picture: object, scene: Scene, kinds: Int[np.ndarray, "h w"]) -> object:
+def _with_legend(picture: Any, scene: Scene, kinds: Int[np.ndarray, "h w"]) -> Any:
     """Return the picture with a legend below it: kinds of pixels, then height and distance of each
     object.
     """
-    assert isinstance(picture, Image.Image)
     shares = [(kinds == k).mean() for k in range(len(KINDS))]
     entries = [
         entry

@@ -85,16 +85,11 @@ def solids_by_link(hand: Hand) -> dict[str, Solid]:
         mine = [solid for solid in solids if solid.link == link]
         if not mine:
             continue
-        # the faces of each shape count its vertices after those of the shapes before
-        starts = np.cumsum([0, *(len(s.vertices) for s in mine)])
-        faces = [s.faces + start for s, start in zip(mine, starts, strict=False)]
-        found[name] = Solid(
-            np.concatenate([s.vertices for s in mine]),
-            np.concatenate(faces),
-            np.concatenate([s.normals for s in mine]),
-            link,
-            mine[0].finger,
+        vertices, faces = trimesh.util.append_faces(
+            [s.vertices for s in mine], [s.faces for s in mine]
         )
+        normals = np.concatenate([s.normals for s in mine])
+        found[name] = Solid(vertices, faces, normals, link, mine[0].finger)
     return found
 
 
@@ -125,10 +120,16 @@ def solids_from_hand(
     order. `obj_from_hand` is the hand's pose [m].
     """
     poses = link_poses(hand, joints[None], names, obj_from_hand[None])[0].cpu().numpy()
+    return place_solids(hand, poses)
+
+
+def place_solids(hand: Hand, obj_from_link: Float[np.ndarray, "l 4 4"]) -> list[Solid]:
+    """Return a hand at the poses [m] of its l links as meshes in the object's frame [m]."""
     placed = []
     for solid in solids_of_links(hand):
-        turn = poses[solid.link, :3, :3].T
-        vertices = solid.vertices @ turn + poses[solid.link, :3, 3]
+        pose = obj_from_link[solid.link]
+        turn = pose[:3, :3].T
+        vertices = solid.vertices @ turn + pose[:3, 3]
         placed.append(solid._replace(vertices=vertices, normals=solid.normals @ turn))
     return placed
 

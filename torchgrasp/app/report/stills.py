@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.app.report import canvas as paint
-from torchgrasp.app.report.canvas import Direction
+from torchgrasp.app.report.raster import Direction
 from torchgrasp.app.report.solids import PARKED, Solid, finger_of_links, solids_from_hand
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import Image
@@ -82,7 +82,8 @@ def draw_surface(
 ) -> bytes:
     """Return a PNG of the estimated surface, coloured by its standard deviation [mm].
 
-    `direction` points to the camera. `table` is the level table, or its height z [m]; None means no table.
+    `direction` points to the camera. `table` is the level table, or its height z [m]; None means
+    no table.
     """
     vertices, faces, normals = mesh_arrays(surface)
     colors, most = paint.color_std(to_array(surface.std_m))
@@ -98,7 +99,8 @@ def draw_contacts(
 ) -> bytes:
     """Return a PNG of the contacts of the first grasp, with normals, on the estimated surface.
 
-    `direction` points to the camera. `table` is the level table, or its height z [m]; None means no table.
+    `direction` points to the camera. `table` is the level table, or its height z [m]; None means
+    no table.
     """
     canvas = paint.Canvas()
     vertices = _add_object(canvas, surface, transparent=True)

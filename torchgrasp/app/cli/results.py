@@ -1,0 +1,155 @@
+"""What `torchgrasp grasp` and the tools for agents make of a plan: a run, its files, and its words."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from torchgrasp.app.cli.command import naming
+from torchgrasp.app.report.page import write_report
+from torchgrasp.app.report.run_data import Run, verdict
+from torchgrasp.app.report.viewer import VIEW, write_viewer
+from torchgrasp.data.shipped import DATA, list_objects, load_object
+from torchgrasp.export import save_surface
+from torchgrasp.export.play import stand
+from torchgrasp.files import sha256
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import hand_of
+from torchgrasp.planner.drag_text import KEY
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.second_view import NextView, next_view
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.success.reasons import explain_success
+from torchgrasp.success.task import GraspTask
+from torchgrasp.values.planning import Grasps, PointCloud
+from torchgrasp.values.specs import ContactSpec
+
+GRASPS = "grasps.safetensors"
+SURFACE = "surface.ply"
+REPORT = "report.html"
+"""Names of the files that are written beside each other into a folder."""
+ENOUGH = 0.9  # predicted success of an object that is easy enough: the others are not tried
+HELPS = 0.8  # share of the deviation that may remain after a second view that is worth telling
+
+
+def make_run(
+    name: str,
+    path: Path,
+    cloud: PointCloud,
+    hand: Hand,
+    spec: ContactSpec,
+    grasps: Grasps,
+    shape: ShapeGP,
+    task: GraspTask,
+    **more: Any,
+) -> Run:
+    """Return the run of a plan, with what lowers the success of its best executable grasp most, and
+    from where a second view would help.
+
+    The first arguments are those of `Run`, and `more` are others by name. `shape` is the estimated
+    shape, and `task` that for which success is predicted.
+    """
+    hand = hand_of(grasps, hand)
+    costs = [
+        cost.sentence
+        for best in grasps[grasps.status == Status.OK][:1]
+        for cost in explain_success(best, hand, shape, task)
+    ]
+    surface = extract_surface(shape)
+    look = find_look(shape, grasps, spec)
+    return Run(
+        name, path, cloud, hand, spec, surface, grasps, costs=tuple(costs), look=look, **more
+    )
+
+
+def write_run(out: Path, run: Run, pages: bool) -> list[Path]:
+    """Write the grasps of a run into a folder, the estimated surface if a grasp is executable, and
+    the `pages` for a person; return the paths.
+    """
+    paths = [out / GRASPS]
+    run.grasps.save(paths[0])
+    if len(run.executable):
+        paths.append(save_surface(stand(run.surface, run.grasps.table), out / SURFACE))
+    if pages:
+        paths += [write_report(out / REPORT, run, VIEW), write_viewer(out / VIEW, run)]
+    return paths
+
+
+def find_look(shape: ShapeGP, grasps: Grasps, spec: ContactSpec) -> NextView | None:
+    """Return from where a second view would help.
+
+    It is None if the best grasp is likely enough, or if no view would tell much.
+    """
+    best = grasps[grasps.status == Status.OK][:1]
+    if len(best) and float(best.success[0]) >= ENOUGH:
+        return None
+    view = next_view(shape, grasps, table=spec.plane)
+    return view if view.after < HELPS * view.before else None
+
+
+def describe_run(run: Run, out: Path) -> dict[str, Any]:
+    """Return the result of a run for JSON, with units in the names.
+
+    `best` is the best executable grasp, or None; `file`, in the folder `out`, holds all grasps.
+    """
+    best = None
+    for grasp in run.executable[:1]:
+        joints = run.hand.expand(grasp.joints[0])
+        best = {
+            "success": float(grasp.success[0]),
+            "joints_rad": {name: float(q) for name, q in joints.items()},
+            "obj_from_hand_m": grasp.obj_from_hand[0].tolist(),
+            "fingers": list(run.hand.finger_names),
+            "contacts_m": grasp.contacts.points[0].tolist(),
+        }
+    return {
+        "object": run.object_name,
+        "hand": run.hand.name,
+        "grasps": len(run.grasps),
+        "executable": len(run.executable),
+        "held": None if run.closure is None else run.closure.held,
+        "verdict": verdict(run),
+        "best": best,
+        "drag": json.loads(run.grasps.meta.get(KEY, "null")),
+        "look_next": None if run.look is None else describe_look(run.look),
+        "file": str(out / "grasps.safetensors"),
+    }
+
+
+def describe_look(view: NextView) -> dict[str, Any]:
+    """Return a camera for a second view for JSON, with units in the names."""
+    return {
+        "obj_from_camera_m": view.camera_pose.tolist(),
+        "turn_deg": view.turn if view.turn == view.turn else None,
+        "std_before_m": view.before,
+        "std_after_m": view.after,
+    }
+
+
+def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
+    """Return the closed mesh [m] of --mesh and, for a shipped object, its convex parts.
+
+    The parts are None for any other mesh.
+    """
+    with naming(path="--mesh", mesh="--mesh"):
+        mesh = read_mesh(path)
+        digest = sha256(path)
+    for name in list_objects():
+        if sha256(DATA / name / "mesh.ply") == digest:
+            return mesh, load_object(name).parts
+    return mesh, None
+
+
+def table_under(mesh: "trimesh.Trimesh", table: Plane | None) -> Plane | None:
+    """Return a table moved along its normal to the lowest point of the true mesh [m]; None for None.
+
+    A robot guesses the height of a table that is not given.
+    """
+    if table is None:
+        return None
+    lowest = float((mesh.vertices @ table.normal.numpy()).min())
+    return dataclasses.replace(table, offset=lowest)
