@@ -1,6 +1,7 @@
 """Ways to run the command line in tests."""
 
 import functools
+import threading
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -29,10 +30,15 @@ def plans_once(kept_plans: None) -> Iterator[None]:
 
 
 @pytest.fixture
-def run_command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+def run_command(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[int, str, str]]:
     """Return a function that runs a command, and returns its exit code and what it printed on
     stdout and stderr.
+
+    No line says how far a command is, however slow the machine.
     """
+    monkeypatch.setattr("torchgrasp.app.cli.command.BEAT", threading.TIMEOUT_MAX)
 
     def run(*words: object) -> tuple[int, str, str]:
         capsys.readouterr()

@@ -12,6 +12,8 @@ import torch
 from tests.make import HALF, halved
 from torchgrasp import cloud_from_depth, load_grasps, load_object
 from torchgrasp.app.cli import command
+from torchgrasp.app.cli.agent_files import Workplace
+from torchgrasp.app.cli.agent_tools import make_tool
 from torchgrasp.app.cli.command import StageProgress, make_bar
 from torchgrasp.cloud import save_cloud
 from torchgrasp.cloud.camera import look_at, render_depth
@@ -106,6 +108,11 @@ def test_a_simulators_cloud_with_its_table_is_planned_on_and_a_cameras_is_refuse
     found = re.search(r"note +(\d+) points of a table without noise are left out: (.*)", out)
     assert code == 0 and found and "0.000 m" in found[2]
     assert abs(int(found[1]) - int((around & (labels == 0)).sum())) < 0.02 * len(cloud)
+    # a tool for agents sees the same cloud
+    tool = make_tool("check_cloud", {"cloud": "cloud.npz"})
+    seen = tool.see(Workplace.at(tmp_path), tmp_path / "cloud.npz")
+    assert len(seen.source) == len(cloud) - int(found[1])
+    assert any(found[0].removeprefix("note").strip() in note for note in seen.notes)
 
 
 def test_a_stage_that_runs_again_counts_once(capsys):

@@ -51,6 +51,7 @@ from torchgrasp.app.cli.inputs import (
     object_name,
     read_distribution,
     read_table,
+    without_exact_table,
 )
 from torchgrasp.app.cli.results import (
     ENOUGH,
@@ -188,7 +189,7 @@ class _SeenTool(Tool):
     def see(self, place: Workplace, path: Path) -> "_Seen":
         """Return the cloud of a file with its table; raise `BadArgument` for an unusable cloud."""
         view = self.options(place)
-        file = view.read("cloud", path)
+        file = without_exact_table(view.read("cloud", path), view.vertical)
         view = view.with_table_of(file)
         table = view.plane(file.cloud)
         advice = view.judge(file.cloud, table)
