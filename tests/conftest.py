@@ -69,7 +69,6 @@ GARBAGE = (50_000, 10, 10)
 
 def pytest_collection_finish() -> None:
     """Take what lives until the end, libraries and tests, out of what the collector looks at."""
-    gc.collect()
     gc.freeze()
     gc.set_threshold(*GARBAGE)
     gc.enable()
