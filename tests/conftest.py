@@ -79,6 +79,17 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     annotations.check_anew()
 
 
+SHARING = {"arm", "campaign", "evaluation", "export", "ros2"}
+"""Folders whose subject is neither shapes nor plans."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shapes_once(request: pytest.FixtureRequest) -> None:
+    """Estimate the shape of each object, and draw the library of each hand, once in such folders."""
+    if request.path.parent.name in SHARING:
+        request.getfixturevalue("kept")
+
+
 @pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
