@@ -69,7 +69,6 @@ GARBAGE = (50_000, 10, 10)
 
 def pytest_collection_finish() -> None:
     """Take what lives until the end, libraries and tests, out of what the collector looks at."""
-    gc.collect()
     gc.freeze()
     gc.set_threshold(*GARBAGE)
     gc.enable()
@@ -78,6 +77,17 @@ def pytest_collection_finish() -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Check annotations of the first calls of the next test, too."""
     annotations.check_anew()
+
+
+SHARING = {"arm", "campaign", "evaluation", "export", "ros2"}
+"""Folders whose subject is neither shapes nor plans."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shapes_once(request: pytest.FixtureRequest) -> None:
+    """Estimate the shape of each object, and draw the library of each hand, once in such folders."""
+    if request.path.parent.name in SHARING:
+        request.getfixturevalue("kept")
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
-"""Estimated shapes, posture libraries and plans that tests with another subject compute once.
+"""Supports, estimated shapes, posture libraries and plans that tests with another subject compute once.
 
-Tests ask for shapes and libraries by the fixture `kept`, and for plans, too, by `kept_plans`. Those
+Tests ask for supports, shapes and libraries by the fixture `kept`, and for plans, too, by `kept_plans`. Those
 of shapes, libraries, plans, costs, and of the same numbers in every call, do not.
 """
 
@@ -51,12 +51,32 @@ def once(key: Any, compute: Callable[[], Any]) -> Any:
 
 @pytest.fixture(scope="module")
 def kept() -> Iterator[None]:
-    """Estimate the shape of each object, and draw the library of each hand, once for all tests."""
+    """Find the supports of each cloud, estimate the shape of each object, and draw the library of
+    each hand, once for all tests.
+    """
+    from torchgrasp.foundation.errors import NoSupport
+    from torchgrasp.geometry import support_planes
     from torchgrasp.ik import seeds
     from torchgrasp.planner.objects import ShapedObject
 
     shaped = ShapedObject.of
     draw = seeds.PostureLibrary._drawn
+    find = support_planes.find_supports
+
+    def supports(*arguments: Any, **options: Any) -> Any:
+        def compute() -> Any:
+            try:
+                return find(*arguments, **options)
+            except NoSupport as error:
+                return error
+
+        try:
+            found = once(("supports", content(arguments), content(options)), compute)
+        except TypeError:
+            return find(*arguments, **options)
+        if isinstance(found, NoSupport):
+            raise found.with_traceback(None)
+        return found
 
     def shape(request: Any) -> Any:
         compute = functools.partial(shaped, request)
@@ -80,6 +100,8 @@ def kept() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ShapedObject, "of", shape)
         patch.setattr(seeds.PostureLibrary, "_drawn", library)
+        for module in ("geometry.support_planes", "cloud.parts", "cloud.viewpoint"):
+            patch.setattr(f"torchgrasp.{module}.find_supports", supports)
         yield
 
 

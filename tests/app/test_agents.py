@@ -230,10 +230,10 @@ def test_a_wrong_call_is_answered_by_one_sentence(said, call, words):
 
 @pytest.fixture
 def address(folder):
-    """The address of a server by HTTP whose calls end after two seconds."""
+    """The address of a server by HTTP whose calls end after a second."""
     if not PYTHON.exists():
         pytest.skip("scripts/beside mcp makes the environment of the SDK")
-    words = [*COMMAND, str(folder), "--http", "0", "--seconds", "2"]
+    words = [*COMMAND, str(folder), "--http", "0", "--seconds", "1"]
     with subprocess.Popen(
         words, env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE, text=True
     ) as server:
@@ -249,9 +249,9 @@ def test_http_is_served_to_this_machine_alone_and_long_calls_are_ended(address):
     found = converse(address, [long, (*long, 0.5), ("health", {}), ("check_hand", {"hand": "x"})])
     ended, cancelled, health, again = found["results"]
     assert ended["error"] and re.search(
-        "^call: .*, got one that was ended after 2 s", ended["text"]
+        "^call: .*, got one that was ended after 1 s", ended["text"]
     )
-    assert cancelled is None and health["data"]["seconds"] == 2.0
+    assert cancelled is None and health["data"]["seconds"] == 1.0
     assert not again["data"]["sound"]  # another process works on it
     host, port = re.findall(r"//(.*):(\d+)/mcp$", address)[0]
     assert host == "127.0.0.1"

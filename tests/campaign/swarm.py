@@ -3,6 +3,7 @@ scheduler looks on.
 """
 
 import contextlib
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -83,6 +84,12 @@ def kill(cluster: LocalCluster, address: str) -> None:
     cluster.sync(cut)
 
 
-def outstanding(cluster: LocalCluster) -> int:
-    """Return how many tasks the scheduler holds."""
+def outstanding(cluster: LocalCluster, most: int) -> int:
+    """Return how many tasks the scheduler holds, once it has at most so many.
+
+    What a client tells it arrives later, and not in order: a result may leave after the next task
+    has come. A scheduler that keeps more ends the test by its time.
+    """
+    while len(cluster.scheduler.tasks) > most:
+        time.sleep(0.01)
     return len(cluster.scheduler.tasks)

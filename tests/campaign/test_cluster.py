@@ -162,10 +162,13 @@ def few():
 def test_four_of_forty_workers_die_and_every_job_is_written_once(
     forty, tmp_path: Path, monkeypatch
 ):
-    """The scheduler, which holds no more jobs than it may, gives the jobs of the dead to others."""
+    """The scheduler gives the jobs of the dead to others. No more jobs than it may hold are
+    submitted and not yet yielded, and it holds no other.
+    """
     jobs = 100
     most = 45
-    held = list[int]()
+    submitted = 0
+    yielded = 0
     written = Counter[str]()
     asked = campaign(jobs, 16)
     write = folder_module.write_file
@@ -176,11 +179,22 @@ def test_four_of_forty_workers_die_and_every_job_is_written_once(
     FATAL.update(dict.fromkeys((1, 30, 60, 99), forty))
 
     def work(numbers):
-        tasks = ((j, asked.rows[j], asked.meta) for j in numbers)
-        return run_on_cluster(seen_job, tasks, forty.scheduler_address, 60.0)
+        def tasks():
+            nonlocal submitted
+            for j in numbers:
+                submitted += 1
+                yield j, asked.rows[j], asked.meta
 
-    carry_out(asked, tmp_path / "out", work, lambda row: held.append(outstanding(forty)))
-    assert len(forty.scheduler.workers) == 36 and not FATAL and max(held) <= most
+        nonlocal yielded
+        for ended in run_on_cluster(seen_job, tasks(), forty.scheduler_address, 60.0):
+            yielded += 1
+            left = min(most, len(numbers) - yielded)
+            assert submitted - yielded == left
+            assert outstanding(forty, left) <= left
+            yield ended
+
+    carry_out(asked, tmp_path / "out", work)
+    assert len(forty.scheduler.workers) == 36 and not FATAL and yielded == jobs - 1
     tries = Counter(number for number, _ in BEGAN)
     assert {number for number, n in tries.items() if n > 1} >= {1, 30, 60, 99}
     assert set(tries) == set(range(jobs)) - {2}  # which is refused before any work

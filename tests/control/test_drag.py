@@ -77,6 +77,8 @@ class Springs:
         self.ends = ends
         self.generator = None if noise is None else torch.Generator().manual_seed(noise)
         self.feet = self.plan.feet[self.plan.presses].numpy()
+        self.joints = self.hand.expand_joints(self.plan.joints)
+        self.tips = self.hand.tip_centres(self.plan.joints)
         self.anchor = np.full_like(self.feet, np.nan)  # on the block
         self.block = np.zeros(2)
         self.forces = np.zeros_like(self.feet)
@@ -131,13 +133,13 @@ class Springs:
         forces[on] = torch.from_numpy(self.forces) @ turn
         normals = (UP @ turn).expand(f, 3)
         pressed = -(forces * normals).sum(1)
-        tips = self.hand.tip_centres(self.plan.joints)
+        tips = self.tips.clone()
         tips[on] += torch.from_numpy(self.bend) @ turn
         truth = TipContact(pressed, forces, tips, normals.clone())
         radius = self.hand.tips.radius
         self.state = measure(self.state, truth, normals.clone(), radius, PERIOD, self.generator)
-        joints = self.hand.expand_joints(self.plan.joints)
-        return Observation(joints, tips, torch.zeros(f, 3, len(joints)).double(), self.state)
+        jacobian = torch.zeros(f, 3, len(self.joints)).double()
+        return Observation(self.joints, tips, jacobian, self.state)
 
     def run(self):
         """Drag the block; return the controller and the pressing forces of each phase [N]."""
@@ -148,7 +150,7 @@ class Springs:
                 break
             phase = controller.phase
             targets = controller.step(self.feel(), PERIOD)
-            assert torch.equal(targets.joints, self.hand.expand_joints(self.plan.joints))
+            assert torch.equal(targets.joints, self.joints)
             assert targets is controller.targets
             palm = (self.plan.obj_from_hand[:3, :3] @ targets.palm).numpy()
             self.deepest = min(self.deepest, palm[2])
@@ -159,8 +161,10 @@ class Springs:
         return controller, forces
 
 
-@pytest.mark.parametrize(("share", "noise"), [(1.0, None), (0.25, None), (0.25, 0)])
-@pytest.mark.parametrize("name", ["allegro", "barrett"])
+@pytest.mark.parametrize(
+    ("name", "share", "noise"),
+    [("allegro", 1.0, None), ("allegro", 0.25, 0), ("barrett", 0.25, None), ("barrett", 0.25, 0)],
+)
 def test_the_block_goes_as_far_as_planned_although_the_fingers_bend(name, share, noise):
     world = Springs(name, noise=noise, share=share)
     controller, forces = world.run()
@@ -174,7 +178,7 @@ def test_the_block_goes_as_far_as_planned_although_the_fingers_bend(name, share,
     assert world.most < 1.6 * world.plan.force
 
 
-@pytest.mark.parametrize("top", [-0.005, 0.005, 0.02])
+@pytest.mark.parametrize("top", [-0.005, 0.02])
 def test_a_block_of_another_height_is_pressed_as_planned(top):
     world = Springs("allegro", top=top)
     controller, _ = world.run()

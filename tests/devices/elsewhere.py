@@ -50,6 +50,8 @@ INTO = {"__getitem__", "__setitem__", "index_put", "index_put_"}
 """Functions that take indices of the CPU, too."""
 COPIES = {"tolist", "__repr__", "__format__"}
 """Functions that copy a whole tensor to the host."""
+NUMBERS = {torch.Size, torch.dtype, bool, int, float}
+"""Types of results without tensors."""
 DEVICE_OF = Tensor.device.__get__
 IS_CUDA = Tensor.is_cuda.__get__
 HOST_ONLY = Tensor.numpy, Tensor.__array__
@@ -105,6 +107,8 @@ def _moved(value: Any) -> Any:
     """Return every plain tensor of a result as one of the pretended device."""
     if type(value) is Tensor:
         return value.as_subclass(Elsewhere)
+    if type(value) in NUMBERS:
+        return value
     if isinstance(value, list):
         return [_moved(x) for x in value]
     if isinstance(value, tuple):
@@ -146,12 +150,13 @@ class Elsewhere(Tensor):
     @classmethod
     def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run a function of tensors as the device would."""
-        if func == DEVICE_OF:
-            return DEVICE
-        if func == IS_CUDA:
-            return True
-        kwargs = kwargs or {}
         name = getattr(func, "__name__", "")
+        if name == "__get__":
+            if func == DEVICE_OF:
+                return DEVICE
+            if func == IS_CUDA:
+                return True
+        kwargs = kwargs or {}
         with torch._C.DisableTorchFunctionSubclass():
             if func is Tensor.cpu:
                 TRAFFIC.tell("read")
@@ -172,7 +177,7 @@ class Elsewhere(Tensor):
                     return elsewhere(args[0])
                 _refuse_mixes(func, name, args, kwargs)
                 _tell_uploads(name, args)
-                result = func(*map(_home, args), **_all_home(kwargs))
+                result = func(*map(_home, args), **(kwargs and _all_home(kwargs)))
             finally:
                 TRAFFIC.running -= 1
         stays = kwargs.get("device") is not None and torch.device(kwargs["device"]).type == "cpu"
@@ -238,6 +243,8 @@ def _convert(target: torch.device, args: Any, kwargs: dict[str, Any]) -> Tensor:
 
 def _refuse_mixes(func: Any, name: str, args: Any, kwargs: dict[str, Any]) -> None:
     """Raise what a GPU raises for tensors of both devices, except where it takes them."""
+    if not kwargs and all(type(x) is Elsewhere or type(x) in NUMBERS for x in args):
+        return
     tensors = _tensors([*args, *kwargs.values()])
     there = any(isinstance(x, Elsewhere) for x in tensors)
     generator = kwargs.get("generator")

@@ -72,6 +72,11 @@ class Launches(TorchDispatchMode):
         stages: name of the stage of each function of the planner; the innermost one counts.
     """
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Tell torch not to import its compiler for a check of each operation."""
+        return False
+
     def __init__(self, stages: dict[str, str] | None = None) -> None:
         super().__init__()
         self.stages = stages or {}

@@ -101,7 +101,7 @@ def test_grasps_of_every_kind_are_where_the_cloud_is(device, hand, name, few_pos
     same(PLANS[name](sent(VIEW), hand), at_home(lambda: PLANS[name](VIEW, hand)))
 
 
-def test_clouds_planned_together_have_the_grasps_of_each_alone(device, hand):
+def test_clouds_planned_together_have_the_grasps_of_each_alone(device, hand, few_postures):
     clouds = [VIEW, PointCloud(1e-4 * VIEW.points, None, VIEW.viewpoint), cup_view(0.004)]
     task = GraspTask(0.1)
     alone = at_home(lambda: plan_grasps(clouds, hand, SPEC, 2, task=task))
@@ -114,7 +114,9 @@ def test_clouds_planned_together_have_the_grasps_of_each_alone(device, hand):
         assert share_found(here, there.to("cpu")) > 0.9  # rounding may move a few
 
 
-def test_workers_estimate_shapes_for_plans_where_the_clouds_are(device, hand, monkeypatch):
+def test_workers_estimate_shapes_for_plans_where_the_clouds_are(
+    device, hand, monkeypatch, few_postures
+):
     """The workers are played by this process, which alone knows the pretended device."""
     serial = lambda function, tasks, workers, limit: (function(*task) for task in tasks)  # noqa: E731
     monkeypatch.setattr("torchgrasp.planner.many.run_tasks", serial)
@@ -126,13 +128,13 @@ def test_workers_estimate_shapes_for_plans_where_the_clouds_are(device, hand, mo
     assert "refused" in refused.meta and refused.joints.device == DEVICE
 
 
-def test_the_reason_for_no_grasp_is_the_same(device, hand):
+def test_the_reason_for_no_grasp_is_the_same(device, hand, few_postures):
     uncertain = ContactSpec(table=0.0, max_variance=1e-6)
     here = at_home(lambda: explain_empty(VIEW, hand, uncertain, 1))
     assert str(explain_empty(sent(VIEW), hand, uncertain, 1)) == str(here)
 
 
-def test_things_of_a_scene_are_planned_where_it_is(device, hand):
+def test_things_of_a_scene_are_planned_where_it_is(device, hand, few_postures):
     scene = see((0.0, 0.0, 0.06, 0.1))
     same(take_target(sent(scene).select(1), 0), take_target(scene.select(1), 0))
     there = plan_scene(sent(scene), hand, starts=1, enough=0.01)

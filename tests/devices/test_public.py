@@ -10,6 +10,7 @@ import torch
 from tests.arm.ur5e import ur5e
 from tests.devices.conftest import same, sent
 from tests.devices.elsewhere import DEVICE
+from tests.make import see
 from torchgrasp import (
     ClosingReference,
     ContactSpec,
@@ -27,7 +28,6 @@ from torchgrasp import (
     hold_probability,
     load_mixture,
     load_object,
-    load_scene,
     merge_clouds,
     plan_contacts,
     plan_grasps,
@@ -181,7 +181,9 @@ def test_a_given_shape_decides_where_grasps_are(device, hand, shape):
     assert plan_grasps(sent(VIEW), hand, SPEC, 1, shape=shape).joints.device == CPU
 
 
-def test_what_is_asked_of_contacts_and_of_the_arm_is_judged_where_the_cloud_is(device, hand):
+def test_what_is_asked_of_contacts_and_of_the_arm_is_judged_where_the_cloud_is(
+    device, hand, few_postures
+):
     asked = {"resist": ("lift", "push"), "keep": Region.rim(VIEW, 0.0, 0.9), "arm": ur5e(hand)}
     here, there = (plan_grasps(view, hand, SPEC, 2, **asked) for view in (VIEW, sent(VIEW)))
     assert there.arm.device == there.certificate.task_margin.device == DEVICE
@@ -190,15 +192,15 @@ def test_what_is_asked_of_contacts_and_of_the_arm_is_judged_where_the_cloud_is(d
     torch.testing.assert_close(there.certificate.task_margin.cpu(), here.certificate.task_margin)
 
 
-def test_single_precision_goes_in_and_double_comes_out(device, hand):
+def test_single_precision_goes_in_and_double_comes_out(device, hand, few_postures):
     cloud = sent(VIEW.to(torch.float32))
     found = plan_grasps(cloud, hand, SPEC, 1)
     assert found.joints.dtype == torch.float64 and found.joints.device == DEVICE
     assert fit_shape(cloud).predict(cloud.points[:3]).distance.dtype == torch.float32
 
 
-def test_a_scene_is_planned_where_it_is(device, hand):
-    scene = load_scene()
+def test_a_scene_is_planned_where_it_is(device, hand, few_postures):
+    scene = see((0.0, 0.0, 0.06, 0.1), (0.0, 0.1, 0.06, 0.1))
     there = sent(scene)
     occupancy = estimate_occupancy(scene, 1)
     same(estimate_occupancy(there, 1), occupancy)

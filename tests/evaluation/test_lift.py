@@ -67,7 +67,8 @@ def test_a_cylinder_is_held(name):
 def test_same_seed_same_bits_here_and_in_another_process(simulator):
     pytest.importorskip(simulator)
     spec = dataclasses.replace(QUICK, simulator=simulator)
-    first, second, other = (digest(close("allegro", spec=spec, seed=seed)) for seed in (3, 3, 4))
+    first, second = (digest(close("allegro", spec=spec, seed=3)) for _ in range(2))
+    other = digest(quick_trial("allegro", simulator))
     installed = tuple(name for name in ("sapien", "mujoco") if find_spec(name))
     elsewhere = digests_elsewhere("allegro", installed, 3)
     assert first == second == elsewhere[simulator] and first != other

@@ -9,7 +9,7 @@ import trimesh
 
 from tests.make import HALF, box, half_ball, halved, load_hand, see
 from torchgrasp import ContactSpec, Scene, Status, plan_scene
-from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.planner import ThingPlan
 from torchgrasp.planner.graspable import hand_span, is_vague, judge_things, order_by_ease
@@ -190,10 +190,10 @@ GUESSED = {
 @pytest.mark.parametrize("kind", GUESSED)
 def test_success_is_unknown_for_a_clicked_target_whose_outline_is_a_guess(kind):
     camera = look_at(20.0, 45.0, 0.6)
-    depth, labels = render_depth([box(*one) for one in GUESSED[kind]], camera)
+    depth, labels = map(halved, render_depth([box(*one) for one in GUESSED[kind]], camera))
     row, column = torch.nonzero(labels == 1).double().mean(0).round().int().tolist()
     for given in ({"point": (column, row)}, {"mask": labels == 1}):
-        scene = Scene.from_depth(depth, INTRINSICS, camera, table=0.0, **given)
+        scene = Scene.from_depth(depth, HALF, camera, table=0.0, **given)
         objects = pose_request(Request(scene, HAND), HAND)
         grasps = load_shipped_grasp("jug", "allegro")
         (ranked,) = rank(objects, grasps, torch.zeros_like(grasps.status))

@@ -33,7 +33,7 @@ SHORT = {"hold_time": 0.1, "control_rate": 50.0}
 @pytest.mark.parametrize(
     "name", [*RUNS, *(pytest.param(x, marks=pytest.mark.sim) for x in SIMULATED)]
 )
-def test_bench_writes_its_rows(name, tin, tmp_path, monkeypatch):
+def test_bench_writes_its_rows(name, tin, tmp_path, monkeypatch, few_postures, kept):
     monkeypatch.setitem(PROTOCOLS, "household", PROTOCOLS["household"].with_trial(**SHORT))
     subject, short = name.split("/")
     options = Options(
@@ -41,7 +41,7 @@ def test_bench_writes_its_rows(name, tin, tmp_path, monkeypatch):
         (tin,),
         ("tin",),
         hands=("barrett",),
-        starts=8,
+        starts=4,
         batches=(1,),
         scale=2e-4,
         workers=0,

@@ -100,7 +100,7 @@ def test_the_chosen_camera_tells_as_much_as_the_best_of_many(stair, first, shape
         both = merge_clouds([first, second], torch.eye(4).expand(2, 4, 4))
         return mean_deviation(fit_shape(both, table=0.0))
 
-    others = [fused(look_at(FIRST + turn, 35.0, target=stair)) for turn in (0, 90, 180)]
+    others = [fused(look_at(FIRST + turn, 35.0, target=stair)) for turn in (0, 180)]
     told = fused(chosen.camera_pose)
     assert told < 1.1 * min(others) and min(others) < 0.6 * others[0]
     # what was expected came true

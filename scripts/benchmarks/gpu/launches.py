@@ -39,7 +39,7 @@ def count_launches(o: Options) -> list[Row]:
     hand = load_hand(o.hands[0])
     found = dict[int, Launches]()
     with pretend():  # what a process keeps is made before
-        plan_grasps([see(OBJECTS[0], 0).to(DEVICE)], hand, SPEC, 20)
+        plan_grasps([see(OBJECTS[0], 0).to(DEVICE)], hand, SPEC, 4)
     for size in o.batches:
         found[size] = count_plans(hand, views(size), o.starts)
     rows = [batch_row(size, counted, hand, o.starts) for size, counted in found.items()]

@@ -160,7 +160,7 @@ def test_a_warning_names_the_line_of_the_caller(tmp_path):
     assert f"{script}:5: TwoBodies: two bodies" in done.stderr
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 30.0, 45.0])
+@pytest.mark.parametrize("azimuth", [0.0, 45.0])
 def test_without_a_given_camera_lost_rims_are_less_excluded(azimuth):
     brick = on_table(trimesh.creation.box([0.05, 0.09, 0.05]))
     pose = look_at(azimuth, 30.0, target=brick)
