@@ -4,6 +4,7 @@ DexGraspBench's .npy is a pickle, which could run code when it is read, so it is
 docs/exchange.md converts it.
 """
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -47,6 +48,22 @@ ROUNDING = 1e-3  # largest error of a quaternion's length: that of a file of few
 # distance [m] of opened fingertips from their contacts, and linear steps, which reach it to 1 mm
 OPENED = 0.02
 OPENING_STEPS = 4
+LEAST = 1e-12  # least length [m] by which a position is divided
+
+
+@dataclasses.dataclass(frozen=True)
+class OrderNumbers:
+    """Bounds by which the quaternions of a file are found to have another order."""
+
+    grasps: int = 8
+    """Fewest grasps that tell: of fewer, one side may be chance."""
+    one_side: float = 0.9
+    """Least length of the mean direction of the origin in the hands' frames, if it is on one side."""
+    any_side: float = 0.6
+    """Greatest such length in the order that is told to be wrong."""
+
+
+ORDER = OrderNumbers()
 POSE_NUMBERS = 7  # of a pose: a position and a quaternion
 ROOTS = ("root_link", "base_link")  # names of the link whose poses a file has
 # arrays of a DexGraspBench file: read, and those that we know and need not
@@ -370,10 +387,47 @@ def read_poses(
         length = float(np.linalg.norm(turns[far][0]))
         found = f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}"
         raise _refuse(found, "length 1")
-    matrices = np.zeros((0, 3, 3))
-    if len(turns):
-        matrices = spatial.transform.Rotation.from_quat(turns).as_matrix()
-    return rigid(torch.tensor(matrices), torch.tensor(unit_m * numbers[:, :3]))
+    _tell_order(numbers, quaternion)
+    return rigid(
+        torch.tensor(_matrices(numbers, quaternion)), torch.tensor(unit_m * numbers[:, :3])
+    )
+
+
+def _matrices(numbers: np.ndarray, quaternion: Quaternion) -> Float[np.ndarray, "g 3 3"]:
+    """Return the rotations of poses (g, 7), whose quaternions have an order."""
+    turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
+    if not len(turns):
+        return np.zeros((0, 3, 3))
+    return spatial.transform.Rotation.from_quat(turns).as_matrix()
+
+
+def _tell_order(numbers: np.ndarray, quaternion: Quaternion) -> None:
+    """Warn of poses (g, 7) that make sense if their quaternions have the other order.
+
+    Either all of them are half turns that are no turns in the other order; or the origin, in which
+    the object stands, lies on one side of the hand in the other order alone.
+    """
+    other: Quaternion = "wxyz" if quaternion == "xyzw" else "xyzw"
+    still = np.abs(numbers[:, 3 if other == "wxyz" else 6]) > 1 - ROUNDING
+    sides = {order: _one_side(numbers, order) for order in (quaternion, other)}
+    one_sided = len(numbers) >= ORDER.grasps and sides[other] > ORDER.one_side
+    if still.all() and len(still):
+        found = "half turns, and no turns"
+    elif one_sided and sides[quaternion] < ORDER.any_side:
+        found = "hands with the object's origin on any side, and on one side"
+    else:
+        return
+    fix = f"if they are {other}, say so (--quaternion {other})"
+    warn_user(GraspFileWarning, f"quaternions as {quaternion} are {found} as {other}: {fix}")
+
+
+def _one_side(numbers: np.ndarray, quaternion: Quaternion) -> float:
+    """Return how alike the direction of the origin is in the frames of hands, from 0 to 1, given
+    their poses (g, 7).
+    """
+    away = numbers[:, :3] / np.linalg.norm(numbers[:, :3], axis=1, keepdims=True).clip(LEAST)
+    inside = np.einsum("gij,gi->gj", _matrices(numbers, quaternion), away)
+    return float(np.linalg.norm(inside.mean(0))) if len(inside) else 0.0
 
 
 @checked

@@ -25,7 +25,7 @@ from torchgrasp.foundation.limits import CLOUD_BYTES
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import Points, Vector, unit
-from torchgrasp.geometry.plane import FINE
+from torchgrasp.geometry.plane import FINE, Plane
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +62,23 @@ class ProjectionNumbers:
     """Least extent of a view at depth 1, so that nothing is divided by 0."""
 
 
+@dataclasses.dataclass(frozen=True)
+class RayNumbers:
+    """Parameters of the search for depths that are distances from the camera."""
+
+    near: float = 0.005
+    """Greatest distance [m] of points from a plane on which they lie."""
+    drawn: int = 5000
+    """Number of points, about, to which planes are fitted."""
+    fewest: int = 20
+    """Fewest points to which a plane is fitted."""
+    fits: int = 4
+    """Number of fits, each to the points near the plane of the fit before."""
+    better: float = 1.3
+    """Least share of points on the plane, over the share with the depths as they are."""
+
+
+RAYS = RayNumbers()
 IMAGE = ImageNumbers()
 PROJECTION = ProjectionNumbers()
 
@@ -177,6 +194,46 @@ def read_image(
     if (count := int((z > 0).sum())) < IMAGE.least_pixels:
         raise BadArgument("depth", f"{count} measured pixels", f"at least {IMAGE.least_pixels}")
     return DepthImage(z.cpu(), k.cpu(), pose)
+
+
+def tell_rays(image: DepthImage, points: Float[Tensor, "h w 3"], plane: Plane) -> tuple[str, ...]:
+    """Return one note if a support that is bowed would be flat if the depths were the distances of
+    points from the camera, else none.
+
+    `points` [m] are those of the image. The `plane` is fitted to a part of the support.
+    """
+    k = image.intrinsics.double()
+    measured = image.depth > 0
+    row, column = torch.nonzero(measured, as_tuple=True)
+    # rays at depth 1
+    rays = torch.stack(
+        [(column - k[0, 2]) / k[0, 0], (row - k[1, 2]) / k[1, 1], torch.ones_like(row)], -1
+    )
+    seen = image.depth[measured].double()[:, None] * rays
+    part = plane.height(points[measured].double()).abs() < RAYS.near
+    step = 1 + len(seen) // RAYS.drawn
+    nearer = seen / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
+    flat = _share_flat(seen[::step], part[::step])
+    if _share_flat(nearer[::step], part[::step]) < RAYS.better * flat:
+        return ()
+    found = "the support is flat if the depth is the distance along the ray of each pixel"
+    fix = (
+        "give the depth along the optical axis, distance / sqrt(1 + ((u-cx)/fx)^2 + ((v-cy)/fy)^2)"
+    )
+    return (f"{found}: then {fix}",)
+
+
+def _share_flat(points: Points, part: Bool[Tensor, "n"]) -> float:
+    """Return the share of `points` (n, 3) [m] on a plane that is fitted to a part of them, then to
+    all points near it.
+    """
+    if int(part.sum()) < RAYS.fewest:
+        return 1.0
+    for _ in range(RAYS.fits):
+        middle = points[part].mean(0)
+        normal = torch.linalg.svd(points[part] - middle, full_matrices=False).Vh[2]
+        part = ((points - middle) @ normal).abs() < RAYS.near
+    return float(part.double().mean())
 
 
 def scale_pixels(count: int, labels: Int[Tensor, "h w"]) -> float:
