@@ -16,6 +16,7 @@ from tests.pinch import pinch
 from torchgrasp import load_grasps, load_hand
 from torchgrasp.app import cli
 from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign
+from torchgrasp.export.foreign import read_poses
 from torchgrasp.foundation.errors import GraspFileWarning, ModelFileError
 
 SAME = 1e-4  # [m]
@@ -381,3 +382,19 @@ def test_the_orders_and_signs_of_publishers_are_read(tmp_path, name, kind):
     read = read_foreign(file, hand, words.split())
     wanted = tips(hand, hand.expand_joints(joints)[0], place)
     assert np.abs(imported(hand, read)[0] - wanted).max() < SAME
+
+
+def test_quaternions_of_the_other_order_are_told():
+    turns = Rotation.random(12, random_state=0)
+    origin = np.array([0.02, 0.0, 0.11]) + np.random.default_rng(0).normal(0.0, 0.01, (12, 3))
+    places = -turns.apply(origin)  # the object on one side of every hand
+    for order, other in (("wxyz", "xyzw"), ("xyzw", "wxyz")):
+        rows = np.hstack([places, np.array([numbers(turn, order) for turn in turns])])
+        read_poses(rows, order)
+        with pytest.warns(GraspFileWarning, match=f"--quaternion {order}"):
+            read_poses(rows, other)
+        read_poses(rows[:4], other)  # of four, one side may be chance
+        still = np.array([[0.1, 0.0, 0.0, *numbers(Rotation.identity(), order)]])
+        read_poses(still, order)
+        with pytest.warns(GraspFileWarning, match=f"half turns, and no turns as {order}"):
+            read_poses(still, other)

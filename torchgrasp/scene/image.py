@@ -25,7 +25,7 @@ from torchgrasp.foundation.limits import CLOUD_BYTES
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import Points, Vector, unit
-from torchgrasp.geometry.plane import FINE, Plane
+from torchgrasp.geometry.plane import FINE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +70,8 @@ class RayNumbers:
     """Greatest distance [m] of points from a plane on which they lie."""
     drawn: int = 5000
     """Number of points, about, to which planes are fitted."""
+    patches: int = 4
+    """Patches along a side of the image at which the search for a plane starts."""
     fewest: int = 20
     """Fewest points to which a plane is fitted."""
     fits: int = 4
@@ -196,44 +198,45 @@ def read_image(
     return DepthImage(z.cpu(), k.cpu(), pose)
 
 
-def tell_rays(image: DepthImage, points: Float[Tensor, "h w 3"], plane: Plane) -> tuple[str, ...]:
-    """Return one note if a support that is bowed would be flat if the depths were the distances of
+def tell_rays(image: DepthImage) -> tuple[str, ...]:
+    """Return one note if far more points would lie in one plane if the depths were the distances of
     points from the camera, else none.
-
-    `points` [m] are those of the image. The `plane` is fitted to a part of the support.
     """
     k = image.intrinsics.double()
-    measured = image.depth > 0
-    row, column = torch.nonzero(measured, as_tuple=True)
+    row, column = torch.nonzero(image.depth > 0, as_tuple=True)
+    step = 1 + len(row) // RAYS.drawn
+    row = row[::step]
+    column = column[::step]
     # rays at depth 1
     rays = torch.stack(
         [(column - k[0, 2]) / k[0, 0], (row - k[1, 2]) / k[1, 1], torch.ones_like(row)], -1
     )
-    seen = image.depth[measured].double()[:, None] * rays
-    part = plane.height(points[measured].double()).abs() < RAYS.near
-    step = 1 + len(seen) // RAYS.drawn
+    seen = image.depth[row, column].double()[:, None] * rays
     nearer = seen / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-    flat = _share_flat(seen[::step], part[::step])
-    if _share_flat(nearer[::step], part[::step]) < RAYS.better * flat:
+    height, width = image.depth.shape
+    patch = row * RAYS.patches // height * RAYS.patches + column * RAYS.patches // width
+    if _share_flat(nearer, patch) < RAYS.better * _share_flat(seen, patch):
         return ()
     found = "the support is flat if the depth is the distance along the ray of each pixel"
-    fix = (
-        "give the depth along the optical axis, distance / sqrt(1 + ((u-cx)/fx)^2 + ((v-cy)/fy)^2)"
-    )
-    return (f"{found}: then {fix}",)
+    fix = "the depth along the optical axis, distance / sqrt(1 + ((u-cx)/fx)^2 + ((v-cy)/fy)^2)"
+    return (f"{found}: then give {fix}",)
 
 
-def _share_flat(points: Points, part: Bool[Tensor, "n"]) -> float:
-    """Return the share of `points` (n, 3) [m] on a plane that is fitted to a part of them, then to
-    all points near it.
+def _share_flat(points: Points, patch: Int[Tensor, "n"]) -> float:
+    """Return the greatest share of `points` (n, 3) [m] in one plane, which is fitted to a patch of
+    the image, then to all points near it.
     """
-    if int(part.sum()) < RAYS.fewest:
-        return 1.0
-    for _ in range(RAYS.fits):
-        middle = points[part].mean(0)
-        normal = torch.linalg.svd(points[part] - middle, full_matrices=False).Vh[2]
-        part = ((points - middle) @ normal).abs() < RAYS.near
-    return float(part.double().mean())
+    best = 0.0
+    for one in patch.unique().tolist():
+        part = patch == one
+        for _ in range(RAYS.fits):
+            if int(part.sum()) < RAYS.fewest:
+                break
+            middle = points[part].mean(0)
+            normal = torch.linalg.svd(points[part] - middle, full_matrices=False).Vh[2]
+            part = ((points - middle) @ normal).abs() < RAYS.near
+            best = max(best, float(part.double().mean()))
+    return best
 
 
 def scale_pixels(count: int, labels: Int[Tensor, "h w"]) -> float:

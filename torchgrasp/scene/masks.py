@@ -249,6 +249,8 @@ def label_image(
         found = f"{int(target.sum())} of {seen} measured pixels above the table"
         share = f"a {1 / MASKS.least_share:.0f}th"
         least = f"at least {IMAGE.least_pixels}, and {share}: this target is the table"
+        if float(mask.double().mean()) > MASKS.whole:
+            least += ", as of an inverted mask"
         raise BadArgument("mask", found, least)
     rest = _dense(_beside(objects, target, mask, belongs))
     low = mask & ~inside & _on_support(view)

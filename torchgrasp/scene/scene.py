@@ -19,7 +19,7 @@ from torchgrasp.cloud.pose import (
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.foundation.base import Value, kept, settle
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.foundation.rules import Pose, Positive
 from torchgrasp.geometry.frames import inverse
@@ -191,14 +191,19 @@ class Scene(Value):
         given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
         points = image.points()
         measured = image.depth > 0
-        supports = find_plausible(
-            points[measured],
-            image.obj_from_camera,
-            table,
-            up,
-            depth_unit is not None,
-            _target(points[measured], None if inside is None else inside[measured]),
-        )
+        try:
+            supports = find_plausible(
+                points[measured],
+                image.obj_from_camera,
+                table,
+                up,
+                depth_unit is not None,
+                _target(points[measured], None if inside is None else inside[measured]),
+            )
+        except NoSupport as error:
+            if rays := tell_rays(image):
+                raise NoSupport("table", error.found, f"{error.allowed}; {rays[0]}") from None
+            raise
         found, notes = label_image(TableImage(image, points, supports[0]), given, inside)
         if table is None and depth_unit is None:
             notes += check_sizes(
@@ -209,7 +214,7 @@ class Scene(Value):
         if table is not None:
             notes += tell_layer(points[measured], supports[0].plane)
         elif supports[0].local:
-            notes += (LOCAL, *tell_rays(image, points, supports[0].plane))
+            notes += (LOCAL, *tell_rays(image))
         if table is None and up is None:
             notes += tell_tilt(image.obj_from_camera, supports[0].plane)
         pixels = torch.nonzero(measured)
