@@ -28,9 +28,9 @@ class AdviceNumbers:
     """Fewest points that show whether a camera is right, or whether pixels fly off rims."""
     narrow: float = 0.06
     """Least width [m] of a level plane that counts as a table left in the cloud."""
-    afloat: float = 0.03
+    afloat: float = 0.06
     """Greatest height [m] of an object's lowest point above its table without advice: cameras lose
-    the points just above a table.
+    the points just above a table, and things before it hide more.
     """
     level: float = 0.97
     """Cosine between a table's normal and the vertical, below which advice names the normal."""
