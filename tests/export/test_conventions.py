@@ -16,7 +16,6 @@ from tests.pinch import pinch
 from torchgrasp import load_grasps, load_hand
 from torchgrasp.app import cli
 from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign
-from torchgrasp.export.foreign import read_poses
 from torchgrasp.foundation.errors import GraspFileWarning, ModelFileError
 
 SAME = 1e-4  # [m]
@@ -384,17 +383,24 @@ def test_the_orders_and_signs_of_publishers_are_read(tmp_path, name, kind):
     assert np.abs(imported(hand, read)[0] - wanted).max() < SAME
 
 
-def test_quaternions_of_the_other_order_are_told():
+def test_quaternions_of_the_other_order_are_told(tmp_path):
+    hand = load_hand("barrett")
+    every = hand.expand_joints(middle(hand))[0].numpy()
     turns = Rotation.random(12, random_state=0)
     origin = np.array([0.02, 0.0, 0.11]) + np.random.default_rng(0).normal(0.0, 0.01, (12, 3))
     places = -turns.apply(origin)  # the object on one side of every hand
+
+    def read(rows, quaternion, **world):
+        np.savez(tmp_path / "a.npz", grasp_qpos=np.array(rows), **world)
+        read_foreign(tmp_path / "a.npz", hand, hand.tree.joint_names, quaternion)
+
     for order, other in (("wxyz", "xyzw"), ("xyzw", "wxyz")):
-        rows = np.hstack([places, np.array([numbers(turn, order) for turn in turns])])
-        read_poses(rows, order)
+        rows = [row(place, every, order) for place in zip(places, turns, strict=True)]
+        read(rows, order)
         with pytest.warns(GraspFileWarning, match=f"--quaternion {order}"):
-            read_poses(rows, other)
-        read_poses(rows[:4], other)  # of four, one side may be chance
-        still = np.array([[0.1, 0.0, 0.0, *numbers(Rotation.identity(), order)]])
-        read_poses(still, order)
+            read(rows, other)
+        read(rows[:4], other)  # of four, one side may be chance
+        still = row((np.zeros(3), Rotation.identity()), [], order)
+        read(rows, order, obj_pose=still)
         with pytest.warns(GraspFileWarning, match=f"half turns, and no turns as {order}"):
-            read_poses(still, other)
+            read(rows[:4], other, obj_pose=still)

@@ -170,10 +170,10 @@ def read_foreign(
     dofs = _table(content["dofs"], len(columns))
     if len(pose) != len(dofs):
         raise _refuse(f"{path}: {len(pose)} poses, {len(dofs)} postures", "as many of either")
-    poses = read_poses(pose, quaternion, unit_m)
+    poses = _poses_of_file(pose, quaternion, unit_m)
     if "obj_pose" in content:
         world = content["obj_pose"].numbers(POSE_NUMBERS, -FAR, FAR)
-        poses = inverse(read_poses(np.array([world]), quaternion, unit_m)) @ poses
+        poses = inverse(_poses_of_file(np.array([world]), quaternion, unit_m)) @ poses
     joints = read_posture(hand, read_columns(hand, columns, dofs, _refuse), "grasp", _refuse)
     named = [content[name].text() for name in ROOTS if name in content]
     poses = poses @ _link_from_root(hand, joints, root if root != "" else "".join(named[:1]))
@@ -296,7 +296,7 @@ def _read_bench(
     poses = dict[str, Tensor]()
     joints = dict[str, Tensor]()
     for name, table in rows.items():
-        poses[name] = read_poses(table[:, :POSE_NUMBERS], quaternion, unit_m)
+        poses[name] = _poses_of_file(table[:, :POSE_NUMBERS], quaternion, unit_m)
         if name == "obj_pose":
             continue
         values = read_columns(hand, columns, table[:, POSE_NUMBERS:], _refuse)
@@ -387,10 +387,18 @@ def read_poses(
         length = float(np.linalg.norm(turns[far][0]))
         found = f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}"
         raise _refuse(found, "length 1")
-    _tell_order(numbers, quaternion)
     return rigid(
         torch.tensor(_matrices(numbers, quaternion)), torch.tensor(unit_m * numbers[:, :3])
     )
+
+
+def _poses_of_file(
+    numbers: np.ndarray, quaternion: Quaternion, unit_m: float
+) -> Float[Tensor, "g 4 4"]:
+    """Return the poses of `read_poses`; warn if their quaternions make sense in the other order."""
+    poses = read_poses(numbers, quaternion, unit_m)
+    _tell_order(numbers, quaternion)
+    return poses
 
 
 def _matrices(numbers: np.ndarray, quaternion: Quaternion) -> Float[np.ndarray, "g 3 3"]:
