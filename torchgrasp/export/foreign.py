@@ -173,7 +173,8 @@ def read_foreign(
     poses = _poses_of_file(pose, quaternion, unit_m)
     if "obj_pose" in content:
         world = content["obj_pose"].numbers(POSE_NUMBERS, -FAR, FAR)
-        poses = inverse(_poses_of_file(np.array([world]), quaternion, unit_m)) @ poses
+        placed = _poses_of_file(np.array([world]), quaternion, unit_m, world=True)
+        poses = inverse(placed) @ poses
     joints = read_posture(hand, read_columns(hand, columns, dofs, _refuse), "grasp", _refuse)
     named = [content[name].text() for name in ROOTS if name in content]
     poses = poses @ _link_from_root(hand, joints, root if root != "" else "".join(named[:1]))
@@ -296,7 +297,8 @@ def _read_bench(
     poses = dict[str, Tensor]()
     joints = dict[str, Tensor]()
     for name, table in rows.items():
-        poses[name] = _poses_of_file(table[:, :POSE_NUMBERS], quaternion, unit_m)
+        pose = table[:, :POSE_NUMBERS]
+        poses[name] = _poses_of_file(pose, quaternion, unit_m, world=name == "obj_pose")
         if name == "obj_pose":
             continue
         values = read_columns(hand, columns, table[:, POSE_NUMBERS:], _refuse)
@@ -393,11 +395,14 @@ def read_poses(
 
 
 def _poses_of_file(
-    numbers: np.ndarray, quaternion: Quaternion, unit_m: float
+    numbers: np.ndarray, quaternion: Quaternion, unit_m: float, world: bool = False
 ) -> Float[Tensor, "g 4 4"]:
-    """Return the poses of `read_poses`; warn if their quaternions make sense in the other order."""
+    """Return the poses of `read_poses`; warn if their quaternions make sense in the other order.
+
+    They are those of hands, or of objects in the `world`.
+    """
     poses = read_poses(numbers, quaternion, unit_m)
-    _tell_order(numbers, quaternion)
+    _tell_order(numbers, quaternion, world)
     return poses
 
 
@@ -409,19 +414,19 @@ def _matrices(numbers: np.ndarray, quaternion: Quaternion) -> Float[np.ndarray, 
     return spatial.transform.Rotation.from_quat(turns).as_matrix()
 
 
-def _tell_order(numbers: np.ndarray, quaternion: Quaternion) -> None:
+def _tell_order(numbers: np.ndarray, quaternion: Quaternion, world: bool) -> None:
     """Warn of poses (g, 7) that make sense if their quaternions have the other order.
 
-    Either all of them are half turns that are no turns in the other order; or the origin, in which
-    the object stands, lies on one side of the hand in the other order alone.
+    In the other order alone, the origin, in which the object stands, lies on one side of the hand.
+    Or the poses are those of objects in the `world`: half turns that are no turns in it.
     """
     other: Quaternion = "wxyz" if quaternion == "xyzw" else "xyzw"
     still = np.abs(numbers[:, 3 if other == "wxyz" else 6]) > 1 - ROUNDING
     sides = {order: _one_side(numbers, order) for order in (quaternion, other)}
     one_sided = len(numbers) >= ORDER.grasps and sides[other] > ORDER.one_side
-    if still.all() and len(still):
+    if world and still.all():
         found = "half turns, and no turns"
-    elif one_sided and sides[quaternion] < ORDER.any_side:
+    elif not world and one_sided and sides[quaternion] < ORDER.any_side:
         found = "hands with the object's origin on any side, and on one side"
     else:
         return
