@@ -15,7 +15,7 @@ from tests.make import HALF, box, halved
 from torchgrasp import Scene, read_cloud, read_scene
 from torchgrasp.app import cli
 from torchgrasp.app.cli import grasp as grasps
-from torchgrasp.app.cli.inputs import CloudOptions, ViewOptions
+from torchgrasp.app.cli.inputs import CloudOptions, ViewOptions, read_region, with_edge
 from torchgrasp.cloud import (
     diagnose_cloud,
     estimate_normals,
@@ -833,3 +833,36 @@ def test_normals_without_a_camera_are_planned_and_the_check_says_so(tmp_path, ca
         torch.randn(600, 3, generator=torch.Generator().manual_seed(0)), dim=-1
     )
     assert diagnose_cloud(PointCloud(0.04 * ball, ball)).viewpoint is None
+
+
+@pytest.mark.parametrize(("factor", "name"), [(1000.0, "mm"), (100.0, "cm"), (20.0, "")])
+def test_a_pose_of_a_cloud_that_is_not_in_metres_is_told(tmp_path, factor, name):
+    pose = POSE.numpy().copy()
+    pose[:3, 3] = factor * np.array([0.9, 0.4, 0.6])
+    np.savetxt(tmp_path / "pose.txt", pose)
+    path = write(tmp_path / "a.npz", in_camera(jug()))
+    options = ViewOptions(camera_pose=tmp_path / "pose.txt")
+    if name:
+        with pytest.raises(BadArgument, match=f"--camera-pose: .* in {name}, divide"):
+            options.read("CLOUD", path)
+    else:
+        (note,) = options.read("CLOUD", path).notes
+        assert "22.9 m from the origin" in note or "23.1 m from the origin" in note
+
+
+def test_an_object_far_above_its_table_is_told():
+    for table, told in ((0.0, False), (-0.02, False), (-0.08, True), (-13.0, True)):
+        advice = diagnose_cloud(jug(), table=Plane.horizontal(table)).advice
+        found = [one for one in advice if "above its table" in one.found]
+        assert bool(found) == told and not any(one.refused for one in found)
+    assert not diagnose_cloud(jug(), stands=False).advice
+
+
+def test_a_box_or_an_edge_of_hundreds_of_metres_is_told(capsys):
+    assert read_region("--keep", "-0.1 -0.1 0.05 0.1 0.1 0.2") is not None
+    with_edge(0.0, (0.15, 0.0, 1.0, 0.0))
+    assert capsys.readouterr().out == ""
+    assert read_region("--keep", "-70 -40 5 50 50 160") is not None
+    with_edge(0.0, (150.0, 0.0, 1.0, 0.0))
+    said = capsys.readouterr().out.splitlines()
+    assert "--keep: a box of 120 x 90 x 155 m" in said[0] and "--edge: a point 150 m" in said[1]

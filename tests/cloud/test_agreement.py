@@ -17,7 +17,7 @@ from torchgrasp.cloud.agreement import (
 )
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.foundation.errors import BadArgument, NoEffect
+from torchgrasp.foundation.errors import BadArgument, CloudWarning, NoEffect
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
 
@@ -146,3 +146,10 @@ def test_such_a_table_is_told_once_and_the_shape_is_that_of_any_table_as_low():
     first, second = (shape.predict(at) for shape in shapes)
     torch.testing.assert_close(first.distance, second.distance, rtol=0.0, atol=1e-4)
     torch.testing.assert_close(first.std_m, second.std_m, rtol=0.0, atol=1e-5)  # [m]
+
+
+def test_a_similar_mesh_is_told():
+    check_mesh(view(), BOX)
+    similar = trimesh.creation.box((0.071, 0.069, 0.126)).apply_translation((0.0, 0.0, 0.063))
+    with pytest.warns(CloudWarning, match=r"--mesh: half of the cloud's points are over \d mm off"):
+        check_mesh(view(), similar, "--mesh")

@@ -6,7 +6,13 @@ import torch
 
 from torchgrasp import Scene
 from torchgrasp.cloud.depth import cloud_from_depth, read_depth
-from torchgrasp.foundation.errors import BadArgument, MendedInput, SuspiciousScale, TooFewPoints
+from torchgrasp.foundation.errors import (
+    BadArgument,
+    CloudWarning,
+    MendedInput,
+    SuspiciousScale,
+    TooFewPoints,
+)
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
 K = torch.tensor([[600.0, 0, 30], [0, 550.0, 20], [0, 0, 1]], dtype=torch.float64)
@@ -507,3 +513,21 @@ def test_a_swapped_principal_point_is_named():
     ):
         with pytest.raises(BadArgument, match="cx of the column before cy of the row"):
             cloud_from_depth(depth, camera)
+
+
+def test_a_mask_of_several_numbers_is_told():
+    mask = torch.zeros(48, 64, dtype=torch.uint8)
+    mask[5:20] = 255
+    whole = cloud_from_depth(tilted_depth(), K, mask)
+    mask[10:20] = 128
+    with pytest.warns(CloudWarning, match="mask: numbers from 128 to 255 count as one object"):
+        assert len(cloud_from_depth(tilted_depth(), K, mask)) == len(whole)
+
+
+def test_depths_that_end_at_one_are_told():
+    depth = tilted_depth()
+    cloud_from_depth(depth, K)
+    depth[:, 50:] = 1.0
+    with pytest.warns(CloudWarning, match="22% of the depths are exactly 1"):
+        cloud_from_depth(depth, K)
+    cloud_from_depth(depth, K, depth_unit=1.0)  # whose user says metres is believed

@@ -16,7 +16,7 @@ from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.pose import read_camera_pose, read_pose, tell_furniture
 from torchgrasp.cloud.prepare import merge_clouds
-from torchgrasp.foundation.errors import BadArgument, MendedInput
+from torchgrasp.foundation.errors import BadArgument, CloudWarning, MendedInput, NoSupport
 from torchgrasp.foundation.rules import is_rigid
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
@@ -323,3 +323,69 @@ def test_slats_before_a_wall_are_a_table_and_furniture_that_stands_on_a_plane_is
     (note,) = tell_furniture(bench, torch.ones(500, dtype=torch.long))
     assert "as furniture or a wall" in note
     assert not Scene.from_depth(*seen()[:1], HALF).notes
+
+
+def test_an_image_upside_down_is_told_in_the_camera_s_own_frame():
+    depth, _ = seen()
+    assert Scene.from_depth(depth, HALF).notes == ()
+    (note,) = Scene.from_depth(depth.flip(0), HALF).notes
+    assert "mirrored" in note and "depth[::-1]" in note
+    table = right().table.moved(inverse(seen()[1]))
+    hanging = Plane(table.normal * torch.tensor([1.0, -1.0, 1.0]).double(), table.offset)
+    assert Scene.from_depth(depth.flip(0), HALF, table=hanging).notes == ()
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("off", [-0.3, -0.02, 0.015, 0.05])
+def test_a_given_table_beside_the_layer_of_the_points_is_told(view, off):
+    depth, pose = seen(view)
+    assert Scene.from_depth(depth, HALF, pose, table=0.0).notes == ()
+    (note,) = Scene.from_depth(depth, HALF, pose, table=off).notes
+    side = "below" if off < 0 else "above"
+    assert f"the given table is {1e3 * abs(off):.0f} mm {side}" in note
+    assert abs(float(re.findall(r"is it at (\S+) m", note)[0])) < 0.002
+
+
+def test_a_tilt_by_a_wrong_focal_length_is_told():
+    depth, pose = seen()
+    wrong = HALF * torch.tensor([[1.4], [1.4], [1.0]]).double()
+    wrong[:2, 2] = HALF[:2, 2]
+    (note,) = Scene.from_depth(depth, wrong, pose).notes
+    assert "focal length" in note and "tilted by" in note
+
+
+def test_counts_that_are_too_small_are_told():
+    depth, pose = seen()
+    small = np.uint16((256 * depth).numpy())  # counts of 1/256 m, as of driving
+    for given in ({}, {"camera_pose": pose}):
+        told = Scene.from_depth(small, HALF, **given).notes
+        assert any("depth_unit" in note and "0.126 m above the table" in note for note in told)
+        metres = Scene.from_depth(small, HALF, **given, depth_unit=1 / 256).notes
+        assert not any("depth_unit" in note for note in metres)
+
+
+def test_a_missing_table_of_a_far_view_names_the_unit():
+    with pytest.raises(NoSupport, match=r"look at depth_unit"):
+        Scene.from_depth(np.full((240, 320), 2500, dtype=np.uint16), HALF)
+    with pytest.raises(NoSupport, match="a table that is given, got"):
+        Scene.from_depth(np.full((240, 320), 2500, dtype=np.uint16), HALF, depth_unit=0.001)
+
+
+def test_a_pose_in_the_frame_of_the_camera_s_start_is_no_wrong_unit():
+    depth, pose = seen()
+    depth = 2.0 * depth  # a camera 0.99 m high
+    for above in (0.23, 0.27):
+        start = scaled(pose, 2.1)
+        start = rigid(start[:3, :3], start[:3, 3] * torch.tensor([1.0, 1.0, 0.0]).double())
+        start[2, 3] = above
+        scene = Scene.from_depth(2.1 / 2.0 * depth, HALF, start)
+        assert len(scene.things) == 2 and "depth_unit" in scene.notes[0]
+
+
+def test_a_camera_far_from_its_origin_is_told_where_no_table_is_seen():
+    depth, pose = seen()
+    near = torch.where(depth < 0.62, depth, 0.0)
+    assert len(cloud_from_depth(near, HALF, camera_pose=pose)) > 100
+    far = rigid(pose[:3, :3], torch.tensor([40.0, 0.0, 50.0]).double())
+    with pytest.warns(CloudWarning, match="divide camera_pose.* by 100"):
+        cloud_from_depth(near, HALF, camera_pose=far)

@@ -6,18 +6,20 @@ from scipy.spatial.transform import Rotation
 
 from tests.make import directions
 from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.diagnose import diagnose_cloud
 from torchgrasp.cloud.neighbours import fit_local_planes
 from torchgrasp.cloud.prepare import (
     MAX_POINTS,
     clean_cloud,
     compare_normals,
     estimate_normals,
+    point_inward,
     prepare_cloud,
     share_facing,
 )
 from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.data.shipped import list_objects, load_object
-from torchgrasp.foundation.errors import TooFewPoints
+from torchgrasp.foundation.errors import CloudWarning, TooFewPoints
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.values.planning import PointCloud
@@ -257,3 +259,19 @@ def test_a_view_faces_its_camera_and_a_whole_surface_does_not(name):
     assert share_facing(view.points, view.normals, each) == share_facing(
         view.points, view.normals, view.viewpoint
     )
+
+
+@pytest.mark.parametrize("name", list_objects())
+def test_normals_to_the_middle_are_told_where_no_camera_shows_their_side(name):
+    seen = estimate_normals(load_object(name).view)
+    whole = surface(load_object(name).mesh, 1500)
+    for cloud in (PointCloud(seen.points, seen.normals), whole):
+        inward = PointCloud(cloud.points, -cloud.normals)
+        assert not point_inward(cloud.points, cloud.normals)
+        assert point_inward(inward.points, inward.normals)
+        assert not any("to the middle" in str(x) for x in diagnose_cloud(cloud).advice)
+        (said,) = [x for x in diagnose_cloud(inward).advice if "to the middle" in str(x)]
+        assert not said.refused and "--no-normals" in said.fix
+        prepare_cloud(cloud, torch.Generator())
+        with pytest.warns(CloudWarning, match="normals: they point to the middle"):
+            prepare_cloud(inward, torch.Generator())

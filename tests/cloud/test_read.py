@@ -8,6 +8,7 @@ import pytest
 import torch
 import trimesh
 
+from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.pcd import decompress
 from torchgrasp.cloud.read import cloud_from_array, read_cloud, read_cloud_file, save_cloud
 from torchgrasp.files.columns import read_lines
@@ -153,6 +154,49 @@ def test_the_default_viewpoint_of_pcd_counts_only_where_a_camera_can_have_been_t
     assert (file.cloud.viewpoint is not None) == believed
     assert believed != any("default viewpoint" in note for note in file.notes)
     assert read_cloud(tmp_path / "a.pcd", viewpoint=[0.0, 0.0, 0.0]).viewpoint.tolist() == [0, 0, 0]
+
+
+def test_the_base_of_a_robot_below_all_points_is_no_camera(tmp_path):
+    body = trimesh.creation.icosphere(3, 0.05).apply_translation([0.5, 0.0, 0.05])
+    seen = partial_view(body, look_at(180.0, 10.0, 0.5, body), 600, noise=False).points.numpy()
+    for height, believed in ((0.0, False), (-0.1, True)):  # of the table over the base
+        (tmp_path / "a.pcd").write_bytes(pcd(seen + np.array([0.0, 0.0, height])))
+        file = read_cloud_file(tmp_path / "a.pcd")
+        assert (file.cloud.viewpoint is not None) == believed
+        assert believed != any("default viewpoint" in note for note in file.notes)
+
+
+@pytest.mark.parametrize("place", [[0.7, 0.5, 0.7], [-1.0, -1.0, -1.0], [0.5, 0.0, -0.3]])
+@pytest.mark.parametrize("missing", [20, 300, 4000])
+def test_missing_pixels_are_left_out_wherever_they_are(tmp_path, place, missing):
+    seen = cap(120, [0.5, 0.0, 0.04])
+    rows = np.vstack([seen, np.tile(place, (missing, 1))])
+    np.save(tmp_path / "a.npy", rows[np.random.default_rng(0).permutation(len(rows))])
+    file = read_cloud_file(tmp_path / "a.npy")
+    if missing == 20:  # as few may be copies of a point
+        assert len(file.cloud) == len(rows) and not file.notes
+        return
+    assert sorted(file.cloud.points.tolist()) == sorted(seen.tolist())
+    (note,) = file.notes
+    assert note.startswith(f"{missing} of {len(rows)} rows at exactly (") and "missing" in note
+
+
+def test_copies_of_points_are_no_missing_pixels(tmp_path):
+    seen = cap(0, [0.0, 0.0, 0.5])
+    for rows in (np.repeat(seen, 50, 0), np.tile(seen, (50, 1)), np.round(seen, 2)):
+        np.save(tmp_path / "a.npy", rows)
+        file = read_cloud_file(tmp_path / "a.npy")
+        assert len(file.cloud) == len(rows) and not file.notes
+
+
+def test_the_numbers_of_columns_are_no_point(tmp_path, points):
+    for width, table in ((3, points), (6, np.hstack([points, unit_rows(60)]))):
+        text = "\n".join(",".join(map(repr, map(float, row))) for row in table)
+        path = tmp_path / "a.csv"
+        path.write_text(",".join(map(str, range(width))) + "\n" + text)
+        assert np.array_equal(read_cloud_file(path).cloud.points.numpy(), points)
+    path.write_text("0 1 2\n3 4 7\n9 9 1\n5 6 8\n")  # whole numbers are points
+    assert len(read_cloud_file(path).cloud) == 4
 
 
 def compress(data):

@@ -381,3 +381,26 @@ def test_the_orders_and_signs_of_publishers_are_read(tmp_path, name, kind):
     read = read_foreign(file, hand, words.split())
     wanted = tips(hand, hand.expand_joints(joints)[0], place)
     assert np.abs(imported(hand, read)[0] - wanted).max() < SAME
+
+
+def test_quaternions_of_the_other_order_are_told(tmp_path):
+    hand = load_hand("barrett")
+    every = hand.expand_joints(middle(hand))[0].numpy()
+    turns = Rotation.random(12, random_state=0)
+    origin = np.array([0.02, 0.0, 0.11]) + np.random.default_rng(0).normal(0.0, 0.01, (12, 3))
+    places = -turns.apply(origin)  # the object on one side of every hand
+
+    def read(rows, quaternion, **world):
+        np.savez(tmp_path / "a.npz", grasp_qpos=np.array(rows), **world)
+        read_foreign(tmp_path / "a.npz", hand, hand.tree.joint_names, quaternion)
+
+    for order, other in (("wxyz", "xyzw"), ("xyzw", "wxyz")):
+        rows = [row(place, every, order) for place in zip(places, turns, strict=True)]
+        read(rows, order)
+        with pytest.warns(GraspFileWarning, match=f"--quaternion {order}"):
+            read(rows, other)
+        read(rows[:4], other)  # of four, one side may be chance
+        still = row((np.zeros(3), Rotation.identity()), [], order)
+        read(rows, order, obj_pose=still)
+        with pytest.warns(GraspFileWarning, match=f"half turns, and no turns as {order}"):
+            read(rows[:4], other, obj_pose=still)

@@ -198,3 +198,26 @@ def test_a_scene_of_a_mask_is_read_again_as_it_was_saved(tmp_path, step, first, 
     scene = Scene.from_depth(counts, k, TALL, mask=labels == label, table=0.03)
     again = read_scene(save_scene(scene, tmp_path / "scene.npz"))
     assert dataclasses.replace(again, notes=scene.notes) == scene
+
+
+def test_labels_of_the_table_and_an_inverted_mask_are_told():
+    pose = look_at(20.0, 45.0, 0.7)
+    depth, labels = render_depth(
+        [box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))], pose
+    )
+    for table in (3, 255):  # as OCID, OSD and Isaac Sim have a label for it
+        given = torch.where(labels > 0, labels, table)
+        scene = Scene.from_depth(depth, INTRINSICS, pose, labels=given)
+        assert scene.things == (1, 2)
+        assert any(note.startswith(f"mask {table}: ") for note in scene.notes)
+        for k in (1, 2):
+            seen = int(((labels == k) & (depth > 0)).sum())
+            assert int(scene.rows_of(k).sum()) > 0.95 * seen
+    assert Scene.from_depth(depth, INTRINSICS, pose, mask=labels == 1).notes == ()
+    with pytest.raises(BadArgument, match="this target is the table, as of an inverted mask"):
+        Scene.from_depth(depth, INTRINSICS, pose, mask=labels != 1)
+    depth, labels = render_depth(
+        [box((0.06, 0.05, 0.1)), box((0.2, 0.2, 0.15), (0.05, 0.24))], pose
+    )
+    told = Scene.from_depth(depth, INTRINSICS, pose, mask=labels != 1).notes
+    assert any("is it inverted?" in note for note in told)

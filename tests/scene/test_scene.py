@@ -313,3 +313,20 @@ def test_a_target_far_above_its_table_is_told(foot, told):
     if told:
         height = float(notes[0].split()[3])
         assert height == pytest.approx(foot, abs=0.02)
+
+
+@pytest.mark.parametrize("elevation", [35.0, 60.0])
+def test_distances_along_rays_are_told(elevation):
+    pose = look_at(20.0, elevation, 0.6)
+    depth, _ = render_depth(things(), pose)
+    row, column = torch.meshgrid(*map(torch.arange, depth.shape), indexing="ij")
+    x = (column - K[0, 2]) / K[0, 0]
+    y = (row - K[1, 2]) / K[1, 1]
+    distance = depth * torch.sqrt(x * x + y * y + 1)
+    for given in ({}, {"camera_pose": pose}):
+        assert not any("ray" in note for note in Scene.from_depth(depth, K, **given).notes)
+        try:
+            told = Scene.from_depth(distance, K, **given).notes
+        except NoSupport as error:
+            told = (str(error),)
+        assert any("distance along the ray of each pixel" in note for note in told)

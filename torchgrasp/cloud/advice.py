@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
 from torchgrasp.cloud.parts import PARTS, find_ground, find_second_body
-from torchgrasp.cloud.prepare import FACING, share_facing
+from torchgrasp.cloud.prepare import FACING, INWARD, point_inward, share_facing
 from torchgrasp.cloud.viewpoint import GUESS, UNSEEN, share_unseen
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.errors import BadArgument
@@ -28,6 +28,10 @@ class AdviceNumbers:
     """Fewest points that show whether a camera is right, or whether pixels fly off rims."""
     narrow: float = 0.06
     """Least width [m] of a level plane that counts as a table left in the cloud."""
+    afloat: float = 0.06
+    """Greatest height [m] of an object's lowest point above its table without advice: cameras lose
+    the points just above a table, and things before it hide more.
+    """
     level: float = 0.97
     """Cosine between a table's normal and the vertical, below which advice names the normal."""
     down: float = 0.15
@@ -92,10 +96,13 @@ def judge_view(
     ground = None if support is None else support.plane
 
     found = [_judge_facing(facing), _judge_backward(points, cloud.viewpoint, up)]
+    if cloud.viewpoint is None and cloud.normals is not None:
+        if point_inward(cloud.points.double(), cloud.normals.double()):
+            found.append(Advice(f"normals that point {INWARD}", "--no-normals", False))
     if eye is not None and found[0] is None:
         found.append(_judge_camera(clean, given))
     if stands and table is not None:
-        found.append(_judge_table(cloud, table))
+        found.append(_judge_table(cloud, clean, table))
     if stands and seeing is not None:
         found.append(_judge_height(points, seeing, given, up, table, ground))
         if given and not any(advice and advice.refused for advice in found):
@@ -193,14 +200,22 @@ def _contradict(clean: PointCloud) -> str | None:
     return f"has {worst[1]:.0%} of them behind others"
 
 
-def _judge_table(cloud: PointCloud, table: Plane) -> Advice | None:
-    """Return advice if a table lies above the object's foot."""
+def _judge_table(cloud: PointCloud, clean: PointCloud, table: Plane) -> Advice | None:
+    """Return advice if a table lies above the object's foot, or far below all points.
+
+    `clean` is the cloud without outliers.
+    """
     try:
         check_foot(cloud, table)
     except BadArgument as error:
         found = f"a table that contradicts the cloud, {error.found}"
         return Advice(found, f"--table, {error.allowed}", True)
-    return None
+    foot = float(table.height(clean.points.double()).min())
+    if foot <= ADVICE.afloat:
+        return None
+    found = f"an object that begins {1e3 * foot:.0f} mm above its table"
+    fix = "the table's height in metres (--table), or --no-table for an object in the air"
+    return Advice(found, fix, False)
 
 
 def _judge_height(

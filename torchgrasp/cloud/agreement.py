@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows
-from torchgrasp.foundation.errors import BadArgument, NoEffect
+from torchgrasp.foundation.errors import BadArgument, CloudWarning, NoEffect
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.linalg import Points, norm, unit
@@ -32,6 +32,10 @@ class AgreementNumbers:
     """Greatest distance [m] of points from their mesh, in addition to the noise."""
     share: float = 0.2
     """Greatest share of points that may be farther from their mesh."""
+    beside: float = 0.0005
+    """Greatest median distance [m] of points from their mesh without a warning, in addition to the
+    noise. Views of rendered sensors are nearer to their mesh, those of a similar object farther.
+    """
     guessed: float = 0.4
     """Greatest share of contacts that may be farther from their mesh: one of three, on a side that
     nobody saw.
@@ -60,8 +64,9 @@ def check_agreement(
     other: "trimesh.Trimesh | PointCloud",
     slack: float,
     share: float,
-) -> None:
-    """Raise `BadArgument` if points lie off a mesh, or off a cloud and the space hidden behind it.
+) -> float:
+    """Return the median distance [m] of points from a mesh, or from a cloud and the space hidden
+    behind it; raise `BadArgument` if they lie off it.
 
     At most the fraction `share` of the `points` (n, 3) [m] may be farther than `slack` [m] from
     `other`, the mesh [m] or the cloud. Errors call the argument `name`, and its points `what`.
@@ -82,15 +87,22 @@ def check_agreement(
         found = f"{int(far.sum())} of {len(far)} about {1e3 * off:.0f} mm off"
         allowed = f"{what} within {1e3 * slack:.0f} mm of {surface}: one frame, in metres"
         raise BadArgument(name, found, allowed)
+    return float(distance.median())
 
 
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
     """Raise `BadArgument` if many points of an object's cloud do not lie on the object's mesh.
 
-    The mesh [m] is in the frame of the cloud. Errors call it by `name`.
+    The mesh [m] is in the frame of the cloud. Errors call it by `name`. A mesh that is farther from
+    most points than noise explains, as that of a similar object, raises the warning `CloudWarning`.
     """
-    slack = AGREEMENT.slack + 2 * noise_of(cloud)
-    check_agreement(name, cloud.points, "the cloud's points", mesh, slack, AGREEMENT.share)
+    noise = noise_of(cloud)
+    slack = AGREEMENT.slack + 2 * noise
+    points = cloud.points
+    off = check_agreement(name, points, "the cloud's points", mesh, slack, AGREEMENT.share)
+    if off > AGREEMENT.beside + noise:
+        found = f"half of the cloud's points are over {1e3 * off:.0f} mm off it"
+        warn_user(CloudWarning, f"{name}: {found}: is it the mesh of this object, at its place?")
 
 
 def check_contacts(

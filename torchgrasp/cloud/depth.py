@@ -18,10 +18,10 @@ from torchgrasp.cloud.intrinsics import (
     parse_intrinsics,
 )
 from torchgrasp.cloud.lens import Lens, describe
-from torchgrasp.cloud.pose import check_view, read_camera_pose
+from torchgrasp.cloud.pose import check_view, read_camera_pose, tell_far
 from torchgrasp.cloud.sensor import Image
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, MendedInput, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, CloudWarning, MendedInput, TooFewPoints
 from torchgrasp.foundation.rules import Positive
 from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply, rotate
@@ -132,6 +132,8 @@ def cloud_from_depth(
         view = apply(pose, _points(z_image, k, seen, lens))
         view = view[:: 1 + len(view) // DEPTH.viewed]
         check_view(view, pose.cpu(), up, depth_unit is not None)
+    for note in tell_far(pose):
+        warn_user(CloudWarning, note)
 
     viewpoint = pose[:3, 3]
     frustum = frustum_of_image(k, z_image.shape, lens).to(points)
@@ -215,6 +217,10 @@ def read_depth(
     inside = pixels != 0
     if not bool(inside.any()):
         raise BadArgument("mask", "no pixel inside", "a mask that is not 0 at the object's pixels")
+    marks = pixels[inside]
+    if int(marks.max()) > int(marks.min()):
+        found = f"numbers from {int(marks.min())} to {int(marks.max())} count as one object"
+        warn_user(CloudWarning, f"mask: {found}; if they are several, give mask == number")
     return metres, k, inside.to(image.device), lens
 
 
@@ -237,6 +243,12 @@ def _in_metres(image: Tensor, unit: float | None) -> Image:
         raise BadArgument("depth", f"{float(metres.min()):.4g} m", allowed)
 
     measured = metres[metres > 0]
+    if not whole and unit is None and len(measured) and float(measured.max()) == 1:
+        share = float((measured == 1).double().mean())
+        if share >= DEPTH.background:
+            found = f"{share:.0%} of the depths are exactly 1, and none is larger"
+            fix = "if it is a z-buffer, or depth scaled to 0..1, give metres"
+            warn_user(CloudWarning, f"depth: {found}: {fix}")
     near = measured[measured <= DEPTH.farthest]
     # Renderers write one large number, such as 1e10, where they see nothing.
     background = measured == measured.max() if len(near) else measured > math.inf

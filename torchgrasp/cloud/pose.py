@@ -75,6 +75,10 @@ class PoseNumbers:
     """Another pose is suggested if with it the table tilts by less than this [deg]. It must also
     tilt less than a third as much as now.
     """
+    upturned: float = 0.5
+    """Least part along y of a table's normal in the camera's own frame, whose y points down, from
+    which the camera hangs upside down.
+    """
     sloped: float = 15.0
     """A table tilted by less than this [deg], or as far from upside down, may be a slope."""
     drawn: int = 20_000
@@ -100,8 +104,10 @@ class SizeNumbers:
     """One object in this number may be smaller than the size that is compared with the bounds."""
     low_table: float = -0.5
     """A table below this [m] may be one that a wrong unit moved down."""
-    near: float = 0.05
-    """Greatest difference [m] of a camera's height from that of a known wrong unit."""
+    near: float = 0.005
+    """Greatest difference [m] of a camera's height from that of a known wrong unit. A greater one
+    refuses right poses in the frame of a camera's start, which is near the camera.
+    """
     units: tuple[float, ...] = (0.25, 0.1)
     """Millimetres of one count of the depth that are often read as one millimetre."""
     high: float = 1.0
@@ -120,10 +126,35 @@ class SizeNumbers:
     """Objects larger than this [m] are too large under any high camera."""
     low: float = 0.12
     """Height [m] of a camera below which some object must be larger than `small`."""
+    close: float = 0.2
+    """Height [m] of a camera below which a note names the unit, if all objects are tiny."""
+    tiny: float = 0.05
+    """Objects smaller than this [m] are tiny: counts of 1/256 m give them, read as millimetres."""
     small: float = 0.03
     """Objects that are all smaller than this [m] are too small under a camera lower than `low`."""
 
 
+@dataclasses.dataclass(frozen=True)
+class LayerNumbers:
+    """Bounds of a layer of points that is perhaps the table, beside the table that was given."""
+
+    half: float = 0.005
+    """Half the thickness of the layer [m]: the noise of a near depth camera."""
+    beside: float = 0.008
+    """Least distance [m] of the layer from the table: objects lose their lowest points to a table
+    that is given too high, and rise from one that is given too low.
+    """
+    above: float = 0.1
+    """Greatest height [m] of the table above the layer: a floor is farther below a table."""
+    below: float = 0.5
+    """Greatest height [m] of the layer above the table."""
+    share: float = 0.2
+    """Least share of all points in the layer."""
+    own: float = 0.25
+    """Greatest share of points on the table, over the share of the layer."""
+
+
+LAYER = LayerNumbers()
 POSE = PoseNumbers()
 SIZES = SizeNumbers()
 
@@ -183,6 +214,17 @@ def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
     return read
 
 
+def tell_far(pose: Transform) -> tuple[str, ...]:
+    """Return one note if a camera is so far from its frame's origin that its pose may be in cm, else
+    none.
+    """
+    distance = float(torch.linalg.vector_norm(pose[:3, 3]))
+    if distance <= POSE.farthest_table:
+        return ()
+    fix = "if camera_pose is in cm, divide camera_pose[:3, 3] by 100"
+    return (f"the camera is {distance:.3g} m from the origin of its frame: {fix}",)
+
+
 def _check_distance(pose: Transform, distance: float, most: float, what: str) -> None:
     """Refuse a pose as not in metres if `what`, such as the camera, is over `most` [m] from the
     frame's origin.
@@ -235,7 +277,7 @@ def find_plausible(
         supports = find_table(points, eye, table, up, target, image_up)
         if table is None and up is None and not _is_own(pose):
             supports = _level(supports, points, eye, target)
-    except NoSupport:
+    except NoSupport as error:
         if table is not None:
             raise
         middle = float(((points - eye) @ pose[:3, 2]).median())
@@ -246,7 +288,10 @@ def find_plausible(
         if up is not None and not _is_own(pose):
             with contextlib.suppress(NoSupport):
                 _check_normals(find_table(points, eye, None, None), pose, up)
-        raise
+        if known_unit or middle < SIZES.higher:
+            raise
+        allowed = f"{error.allowed}; of a median depth of {middle:.3g} m, look at depth_unit, too"
+        raise NoSupport("table", error.found, allowed) from None
     if table is None:
         _check_supports(supports, pose, up, known_unit)
     else:
@@ -349,13 +394,22 @@ def _check_normals(supports: tuple[SupportPlane, ...], pose: Transform, up: obje
 def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
     """Return one note if a table is tilted from z of the frame to which `pose` leads, else none.
 
-    A camera's own frame has no such z. `plane` is the table in that frame.
+    A camera's own frame has no such z: there, a note tells of a table above the camera's middle.
+    `plane` is the table in that frame.
     """
+    if _is_own(pose):
+        if float(plane.normal[1]) <= POSE.upturned:
+            return ()
+        return (
+            "the camera hangs upside down, as the table shows; if it does not, the image is "
+            "flipped, and objects are mirrored: give depth[::-1]",
+        )
     cosine = float(plane.normal[2])
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
-    if _is_own(pose) or tilt < POSE.sloped:
+    if tilt < POSE.level:
         return ()
-    fixes = "a wrong camera_pose, or depth that is no distance, such as a z-buffer, tilts it"
+    wrong = "a wrong camera_pose or focal length, or depth that is no distance, such as a z-buffer"
+    fixes = f"if z is up, {wrong}, tilts it; if not, give up"
     return (f"the table is tilted by {tilt:.0f} degrees from z of camera_pose: {fixes}",)
 
 
@@ -373,11 +427,36 @@ def _check_given_table(points: Points, plane: Plane) -> None:
         raise BadArgument("table", found, allowed)
 
 
+def tell_layer(points: Points, plane: Plane) -> tuple[str, ...]:
+    """Return one note if a given table is beside a layer of many points that is parallel to it,
+    else none.
+
+    The layer is perhaps the table. `points` (n, 3) [m] and the `plane` are in one frame.
+    """
+    height = plane.height(points[:: 1 + len(points) // POSE.drawn].double().cpu())
+    near = height[(height > -LAYER.above) & (height < LAYER.below)]
+    if not len(near):
+        return ()
+    place = ((near + LAYER.above) / LAYER.half).long()
+    # two bins at a time, whatever their borders
+    count = torch.bincount(place, minlength=2)
+    count = count[:-1] + count[1:]
+    middle = float(near[(place == count.argmax()) | (place == count.argmax() + 1)].median())
+    share = float((height - middle).abs().le(LAYER.half).double().mean())
+    on = float(height.abs().le(LAYER.half).double().mean())
+    if abs(middle) < LAYER.beside or share < LAYER.share or on > LAYER.own * share:
+        return ()
+    side = "below" if middle > 0 else "above"
+    found = f"the given table is {1e3 * abs(middle):.0f} mm {side} {share:.0%} of the points"
+    return (f"{found}, which lie in one layer: is it at {plane.offset + middle:.4g} m?",)
+
+
 def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -> tuple[str, ...]:
     """Raise `BadArgument` for a unit of the depth that makes objects too large or small for a hand.
 
-    Returns one note if the camera is high, else none. `labels` (n,) holds the object of each of the
-    `points` (n, 3) [m], 0 for none; `plane` is the table. The `pose` leads to their frame.
+    Returns one note if the camera is high, or near to tiny objects, else none. `labels` (n,) holds
+    the object of each of the `points` (n, 3) [m], 0 for none; `plane` is the table. The `pose`
+    leads to their frame.
     """
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
     large_enough = [part for part in parts if len(part) >= SIZES.points]
@@ -394,8 +473,11 @@ def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -
         if large or small:
             found = f"{found} and objects of {sizes[0]:.2g} to {sizes[-1]:.2g} m"
             raise BadArgument("depth", found, UNIT)
-    note = f"{found}: if it was not so high, depth_unit (--depth-unit) says the metres of a count"
-    return (note,) * high
+    metres = "depth_unit (--depth-unit) says the metres of a count"
+    if sizes and sizes[-1] < SIZES.tiny and height < SIZES.close:
+        found = f"{found}, and objects of {1e3 * sizes[0]:.0f} to {1e3 * sizes[-1]:.0f} mm"
+        return (f"{found}: if they are larger, {metres}",)
+    return (f"{found}: if it was not so high, {metres}",) * high
 
 
 def tell_furniture(points: Points, labels: Tensor) -> tuple[str, ...]:

@@ -17,13 +17,14 @@ from torchgrasp.cloud.registration import align_views, compare_views
 from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, NoEffect, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, CloudWarning, NoEffect, TooFewPoints
 from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import Points, Vector, unit, unit_of_any
 from torchgrasp.values.planning import PointCloud
 
 FACING = 0.9  # least share of a view's normals that face the camera; noise turns some at the rim
+INWARD = "to the middle of the points: if they are those of an object, give outward ones, or none"
 MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time of the selection
 
 
@@ -59,6 +60,10 @@ class NormalNumbers:
     """Signs of which this share is opposed are not trusted; random ones oppose half."""
     rounded: float = 1e-3
     """Greatest error of a unit length: text files round to three digits."""
+    inward: float = 0.05
+    """Least mean cosine, weighted with the distance from the middle, between normals and the way to
+    the middle, from which normals point inward: those of a flat view have none.
+    """
 
 
 PREPARE = PrepareNumbers()
@@ -146,6 +151,8 @@ def prepare_cloud(
             if clean and facing < FACING:
                 viewpoint = None
                 _warn_of_one_side(normals, facing)
+        elif point_inward(cloud.points.double(), normals.double()):
+            warn_user(CloudWarning, f"normals: they point {INWARD}")
     estimated = viewpoint is None
     if clean and estimated:
         # before points are moved: the fit of normals smooths the lattice away
@@ -262,6 +269,18 @@ def compare_normals(points: Points, normals: Points) -> NormalCheck:
         oriented=opposed < NORMALS.random,
         scaled=int((error > NORMALS.rounded).sum()),
     )
+
+
+def point_inward(points: Points, normals: Points) -> bool:
+    """Return whether normals (n, 3) point to the middle of their `points` (n, 3) [m], as those of a
+    surface that is inside out.
+
+    For normals that point outward, the sum of (p - c) . n is that of the divergence theorem: three
+    times the volume of a closed surface, and positive for a view of a surface that bulges.
+    """
+    away = points - points.mean(0)
+    outward = float((away * unit_of_any(normals)).sum())
+    return outward < -NORMALS.inward * float(torch.linalg.vector_norm(away, dim=-1).sum())
 
 
 def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*views 3"]) -> float:

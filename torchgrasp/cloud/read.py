@@ -53,6 +53,20 @@ class ReadNumbers:
     """Least median cosine between normals and planes fitted to points: others are colours."""
     alike: float = 0.999
     """Least cosine of nearly all normals with their median if they are alike, as one colour is."""
+    ahead: float = 0.6
+    """A camera in the origin looks along z if the cosine to the middle of the points is above this;
+    else z is up.
+    """
+    searched: int = 1000
+    """Rows, about, among which a place of missing pixels is sought."""
+    fewest: int = 100
+    """Fewest rows that can have such a place."""
+    repeated: float = 0.05
+    """Least share of these rows at such a place."""
+    usual: float = 0.9
+    """Quantile of the rows at a place that counts as usual: clouds may hold copies of points."""
+    more: float = 5.0
+    """Least number of rows at such a place, over the usual one."""
     across: float = 0.1
     """Quantile of the cosines with fitted planes that must be as large if all normals are alike."""
 
@@ -412,6 +426,7 @@ def _find_measured(
         missing = "rows at exactly (0, 0, 0), missing pixels, were left out"
         notes.append(f"{int(origin.sum())} of {total} {missing}")
         finite &= ~origin
+    finite &= ~_find_repeated(points, finite, notes)
     if normals is None:
         return finite, None
     bad = finite & ~(torch.isfinite(normals).all(1) & normals.ne(0).any(1))
@@ -424,14 +439,46 @@ def _find_measured(
     return finite & ~bad, normals
 
 
+def _find_repeated(points: Tensor, keep: Tensor, notes: list[str]) -> Tensor:
+    """Return a mask of the rows at one place that holds far more of the rows `keep` than any other,
+    and add a note on them.
+
+    They are missing pixels: those at (0, 0, 0), moved with the other points, or at (-1, -1, -1).
+    """
+    none = torch.zeros_like(keep)
+    rows = torch.nonzero(keep)[:, 0]
+    some = points[rows[:: 1 + len(rows) // READ.searched]]
+    if len(some) < READ.fewest:
+        return none
+    places, count = some.unique(dim=0, return_counts=True)
+    most = int(count.max())
+    # a cloud may have several copies of each point
+    usual = float(count.double().quantile(READ.usual))
+    if most < READ.repeated * len(some) or most < READ.more * usual:
+        return none
+    place = places[count.argmax()]
+    found = keep & (points == place).all(1)
+    where = ", ".join(f"{x:.6g}" for x in place.tolist())
+    missing = f"rows at exactly ({where}), missing pixels, were left out"
+    notes.append(f"{int(found.sum())} of {len(points)} {missing}")
+    return found
+
+
 def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:
     """Return the cloud, without its viewpoint (0, 0, 0) if no camera can have been there; a note
     then says so.
+
+    In a robot's frame, z is up and the origin is often below all points. In a camera's frame, the
+    points are ahead of the origin along z.
     """
     points = cloud.points[draw_rows(len(cloud), READ.drawn)]
     if bool(points.ne(points[0]).any()):  # else all coincide, which is refused later
         points = points[find_inliers(points)]
-        if can_see(points, fit_local_planes(points)[0], torch.zeros(3, dtype=points.dtype)):
+        middle = points.mean(0)
+        ahead = float(middle[2]) > READ.ahead * float(torch.linalg.vector_norm(middle))
+        below = bool((points[:, 2] > 0).all()) and not ahead
+        origin = torch.zeros(3, dtype=points.dtype)
+        if not below and can_see(points, fit_local_planes(points)[0], origin):
             return cloud
     default = "the default viewpoint (0, 0, 0) of PCD"
     unseen = "from which a camera cannot have seen these points, was left out"

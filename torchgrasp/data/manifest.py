@@ -114,8 +114,8 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
         _check_name(of_view, view)
         pose = of_view.entries("T_object_camera")["T_object_camera"]
         rows = [row.numbers(4, -MOST_METRES, MOST_METRES) for row in pose.items(4)]
-        if len(rows) != 4:
-            raise pose.wrong("4 rows of 4 numbers")
+        if len(rows) != 4 or rows[3] != [0.0, 0.0, 0.0, 1.0]:
+            raise pose.wrong("4 rows of 4 numbers, the last of them 0 0 0 1: is it transposed?")
         views[view] = tuple(row[3] for row in rows[:3])
     scale, mass, family, group = (
         fields.get(key) for key in ("suggested_scale", "mass_kg", "family", "group")

@@ -4,6 +4,7 @@ DexGraspBench's .npy is a pickle, which could run code when it is read, so it is
 docs/exchange.md converts it.
 """
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -47,6 +48,22 @@ ROUNDING = 1e-3  # largest error of a quaternion's length: that of a file of few
 # distance [m] of opened fingertips from their contacts, and linear steps, which reach it to 1 mm
 OPENED = 0.02
 OPENING_STEPS = 4
+LEAST = 1e-12  # least length [m] by which a position is divided
+
+
+@dataclasses.dataclass(frozen=True)
+class OrderNumbers:
+    """Bounds by which the quaternions of a file are found to have another order."""
+
+    grasps: int = 8
+    """Fewest grasps that tell: of fewer, one side may be chance."""
+    one_side: float = 0.9
+    """Least length of the mean direction of the origin in the hands' frames, if it is on one side."""
+    any_side: float = 0.6
+    """Greatest such length in the order that is told to be wrong."""
+
+
+ORDER = OrderNumbers()
 POSE_NUMBERS = 7  # of a pose: a position and a quaternion
 ROOTS = ("root_link", "base_link")  # names of the link whose poses a file has
 # arrays of a DexGraspBench file: read, and those that we know and need not
@@ -153,10 +170,11 @@ def read_foreign(
     dofs = _table(content["dofs"], len(columns))
     if len(pose) != len(dofs):
         raise _refuse(f"{path}: {len(pose)} poses, {len(dofs)} postures", "as many of either")
-    poses = read_poses(pose, quaternion, unit_m)
+    poses = _poses_of_file(pose, quaternion, unit_m)
     if "obj_pose" in content:
         world = content["obj_pose"].numbers(POSE_NUMBERS, -FAR, FAR)
-        poses = inverse(read_poses(np.array([world]), quaternion, unit_m)) @ poses
+        placed = _poses_of_file(np.array([world]), quaternion, unit_m, world=True)
+        poses = inverse(placed) @ poses
     joints = read_posture(hand, read_columns(hand, columns, dofs, _refuse), "grasp", _refuse)
     named = [content[name].text() for name in ROOTS if name in content]
     poses = poses @ _link_from_root(hand, joints, root if root != "" else "".join(named[:1]))
@@ -279,7 +297,8 @@ def _read_bench(
     poses = dict[str, Tensor]()
     joints = dict[str, Tensor]()
     for name, table in rows.items():
-        poses[name] = read_poses(table[:, :POSE_NUMBERS], quaternion, unit_m)
+        pose = table[:, :POSE_NUMBERS]
+        poses[name] = _poses_of_file(pose, quaternion, unit_m, world=name == "obj_pose")
         if name == "obj_pose":
             continue
         values = read_columns(hand, columns, table[:, POSE_NUMBERS:], _refuse)
@@ -370,10 +389,58 @@ def read_poses(
         length = float(np.linalg.norm(turns[far][0]))
         found = f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}"
         raise _refuse(found, "length 1")
-    matrices = np.zeros((0, 3, 3))
-    if len(turns):
-        matrices = spatial.transform.Rotation.from_quat(turns).as_matrix()
-    return rigid(torch.tensor(matrices), torch.tensor(unit_m * numbers[:, :3]))
+    return rigid(
+        torch.tensor(_matrices(numbers, quaternion)), torch.tensor(unit_m * numbers[:, :3])
+    )
+
+
+def _poses_of_file(
+    numbers: np.ndarray, quaternion: Quaternion, unit_m: float, world: bool = False
+) -> Float[Tensor, "g 4 4"]:
+    """Return the poses of `read_poses`; warn if their quaternions make sense in the other order.
+
+    They are those of hands, or of objects in the `world`.
+    """
+    poses = read_poses(numbers, quaternion, unit_m)
+    _tell_order(numbers, quaternion, world)
+    return poses
+
+
+def _matrices(numbers: np.ndarray, quaternion: Quaternion) -> Float[np.ndarray, "g 3 3"]:
+    """Return the rotations of poses (g, 7), whose quaternions have an order."""
+    turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
+    if not len(turns):
+        return np.zeros((0, 3, 3))
+    return spatial.transform.Rotation.from_quat(turns).as_matrix()
+
+
+def _tell_order(numbers: np.ndarray, quaternion: Quaternion, world: bool) -> None:
+    """Warn of poses (g, 7) that make sense if their quaternions have the other order.
+
+    In the other order alone, the origin, in which the object stands, lies on one side of the hand.
+    Or the poses are those of objects in the `world`: half turns that are no turns in it.
+    """
+    other: Quaternion = "wxyz" if quaternion == "xyzw" else "xyzw"
+    still = np.abs(numbers[:, 3 if other == "wxyz" else 6]) > 1 - ROUNDING
+    sides = {order: _one_side(numbers, order) for order in (quaternion, other)}
+    one_sided = len(numbers) >= ORDER.grasps and sides[other] > ORDER.one_side
+    if world and still.all():
+        found = "half turns, and no turns"
+    elif not world and one_sided and sides[quaternion] < ORDER.any_side:
+        found = "hands with the object's origin on any side, and on one side"
+    else:
+        return
+    fix = f"if they are {other}, say so (--quaternion {other})"
+    warn_user(GraspFileWarning, f"quaternions as {quaternion} are {found} as {other}: {fix}")
+
+
+def _one_side(numbers: np.ndarray, quaternion: Quaternion) -> float:
+    """Return how alike the direction of the origin is in the frames of hands, from 0 to 1, given
+    their poses (g, 7).
+    """
+    away = numbers[:, :3] / np.linalg.norm(numbers[:, :3], axis=1, keepdims=True).clip(LEAST)
+    inside = np.einsum("gij,gi->gj", _matrices(numbers, quaternion), away)
+    return float(np.linalg.norm(inside.mean(0))) if len(inside) else 0.0
 
 
 @checked

@@ -197,6 +197,11 @@ def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"
         if some[0].strip().isdecimal():  # a count of the rows, if the next line has more numbers
             some.append(next(every, ""))
         width = len(some[-1].split())
+        if width > 1 and some[0].split() == [str(i) for i in range(width)]:
+            # the numbers of columns without names, if the next line has fractions
+            some.append(next(every, ""))
+            if "." in some[1]:
+                del some[0]
         if (
             not re.search(r"(?i)(?:^|\s)[-+.]*(?:\d|(?:nan|inf)\b)", some[0])
             or len(some[0].split()) < width

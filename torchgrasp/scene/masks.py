@@ -41,6 +41,8 @@ class MaskNumbers:
     """Height [m] above the support below which a pixel counts as lying on it."""
     rim: int = 4
     """Greatest error [pixels] of the border of a given mask."""
+    whole: float = 0.5
+    """Least share of the image in a mask that is perhaps inverted."""
     told: float = 0.05
     """Share of a mask's pixels whose removal is mentioned in a note; a smaller share is not."""
     reach: float = 0.04
@@ -247,6 +249,8 @@ def label_image(
         found = f"{int(target.sum())} of {seen} measured pixels above the table"
         share = f"a {1 / MASKS.least_share:.0f}th"
         least = f"at least {IMAGE.least_pixels}, and {share}: this target is the table"
+        if float(mask.double().mean()) > MASKS.whole:
+            least += ", as of an inverted mask"
         raise BadArgument("mask", found, least)
     rest = _dense(_beside(objects, target, mask, belongs))
     low = mask & ~inside & _on_support(view)
@@ -257,7 +261,12 @@ def label_image(
         *_removed("mask", int(strips.sum()), seen, "another object"),
         *_removed("mask", int(flying.sum()), seen, "no surface, between near and far ones,"),
     ]
-    if notes:
+    share = float(mask.double().mean())
+    if share > MASKS.whole and 2 * int(low.sum()) > seen:
+        notes.append(
+            f"mask: it marks {share:.0%} of the image, mostly the support: is it inverted?"
+        )
+    elif notes:
         notes += _shifted(mask & view.measured, target | (shown[objects] & (objects > 0)))
     return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0)), tuple(notes)
 
@@ -269,17 +278,22 @@ def _trim_labels(
     that loses many.
     """
     kept = torch.where(_on_objects(view, labels), labels, 0)
-    if not bool((kept > 0).any()):
-        raise BadArgument(
-            "labels", "none that rises above the table", "labels of objects on the table"
-        )
     names, own = labels.unique(return_inverse=True)
     lost = count_labels(own[_on_support(view) & (kept == 0)], len(names))
     seen = count_labels(own[view.measured], len(names))
     notes = list[str]()
-    for k, *counts in zip(names.tolist(), lost.tolist(), seen.tolist(), strict=True):
+    left = count_labels(own[kept > 0], len(names))
+    for k, *counts, rest in zip(*(x.tolist() for x in (names, lost, seen, left)), strict=True):
         if k > 0:
             notes += _removed(f"mask {k}", *counts)
+        # as given masks of one object: this one is the table
+        if k > 0 and 0 < rest < MASKS.least_share * counts[1] and 2 * counts[0] > counts[1]:
+            notes.append(f"mask {k}: its other {rest} pixels were removed, too: it is the support")
+            kept = torch.where(kept == k, 0, kept)
+    if not bool((kept > 0).any()):
+        raise BadArgument(
+            "labels", "none that rises above the table", "labels of objects on the table"
+        )
     return kept, tuple(notes)
 
 

@@ -9,11 +9,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.cloud.pose import check_sizes, find_plausible, tell_furniture, tell_tilt
+from torchgrasp.cloud.pose import (
+    check_sizes,
+    find_plausible,
+    tell_furniture,
+    tell_layer,
+    tell_tilt,
+)
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.foundation.base import Value, kept, settle
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.foundation.rules import Pose, Positive
 from torchgrasp.geometry.frames import inverse
@@ -21,7 +27,13 @@ from torchgrasp.geometry.linalg import Points, norm
 from torchgrasp.geometry.plane import Plane, to_upright
 from torchgrasp.geometry.support_planes import SupportPlane, Target, find_table
 from torchgrasp.scene.creases import cut_creases
-from torchgrasp.scene.image import DepthImage, find_nearest, image_of_cloud, read_image
+from torchgrasp.scene.image import (
+    DepthImage,
+    find_nearest,
+    image_of_cloud,
+    read_image,
+    tell_rays,
+)
 from torchgrasp.scene.masks import label_image, read_labels, read_mask
 from torchgrasp.scene.merge import find_touching
 from torchgrasp.scene.segment import find_components
@@ -179,14 +191,19 @@ class Scene(Value):
         given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
         points = image.points()
         measured = image.depth > 0
-        supports = find_plausible(
-            points[measured],
-            image.obj_from_camera,
-            table,
-            up,
-            depth_unit is not None,
-            _target(points[measured], None if inside is None else inside[measured]),
-        )
+        try:
+            supports = find_plausible(
+                points[measured],
+                image.obj_from_camera,
+                table,
+                up,
+                depth_unit is not None,
+                _target(points[measured], None if inside is None else inside[measured]),
+            )
+        except NoSupport as error:
+            if rays := tell_rays(image):
+                raise NoSupport("table", error.found, f"{error.allowed}; {rays[0]}") from None
+            raise
         found, notes = label_image(TableImage(image, points, supports[0]), given, inside)
         if table is None and depth_unit is None:
             notes += check_sizes(
@@ -194,8 +211,10 @@ class Scene(Value):
             )
         if table is None:
             notes += tell_furniture(points[measured], found[measured])
-        if supports[0].local:
-            notes += (LOCAL,)
+        if table is not None:
+            notes += tell_layer(points[measured], supports[0].plane)
+        elif supports[0].local:
+            notes += (LOCAL, *tell_rays(image))
         if table is None and up is None:
             notes += tell_tilt(image.obj_from_camera, supports[0].plane)
         pixels = torch.nonzero(measured)

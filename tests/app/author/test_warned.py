@@ -190,6 +190,7 @@ def test_a_hand_without_shapes_is_refused_by_name(claw):
     ("old", "new", "words"),
     [
         (r'effort="[\d.]+"', 'effort="10000"', r"effort of joints .*left_swivel 1e\+04"),
+        (r'effort="[\d.]+"', 'effort="30"', r"effort of joints .*left_swivel 30"),  # N mm
         (r'effort="[\d.]+"', 'effort="0.0001"', r"effort of joints .*left_swivel 0\.0001"),
         (r'velocity="[\d.]+"', 'velocity="1e6"', r"velocity of joints .*1e\+06"),
         ("0 0 0.06", "0 0 60", r"distance of joints .*left_follow 60"),

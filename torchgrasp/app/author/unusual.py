@@ -25,7 +25,8 @@ class UsualNumbers:
     place: Bounds = (0.0, 0.6)  # distance of a joint from the joint before it [m]
     turn: Bounds = (0.05, 3.6)  # range of a revolute joint [rad]: half a turn and some degrees
     slide: Bounds = (1e-3, 0.2)  # range of a sliding joint [m]
-    torque: Bounds = (0.01, 50.0)  # effort of a revolute joint [N m]
+    # effort of a revolute joint [N m]: more is a placeholder, or in N mm
+    torque: Bounds = (0.01, 9.0)
     force: Bounds = (0.1, 1000.0)  # effort of a sliding joint [N]
     turning: Bounds = (0.05, 200.0)  # velocity of a revolute joint [rad/s]
     sliding: Bounds = (1e-3, 10.0)  # velocity of a sliding joint [m/s]

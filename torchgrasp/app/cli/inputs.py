@@ -21,11 +21,12 @@ from torchgrasp.app.cli.command import arguments, naming, option
 from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, read_cloud_file
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers
 from torchgrasp.cloud.parts import cut_exact_table
-from torchgrasp.cloud.pose import read_pose
+from torchgrasp.cloud.pose import read_camera_pose, read_pose, tell_far
 from torchgrasp.contacts.region import Region
 from torchgrasp.files import hold_folder
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError
+from torchgrasp.foundation.limits import MAX_EXTENT
 from torchgrasp.geometry.frames import apply, real, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane, as_plane
@@ -37,6 +38,7 @@ from torchgrasp.values.specs import Simulator
 
 WIDEST = 1.5  # tangent of half an angle of view wider than that of depth cameras
 MOST_UNSEEN = 0.01  # share of the points outside: more, and the cloud is in another frame
+FAR_EDGE = 10.0  # coordinate of an edge [m] above which its unit is told
 LEVEL = 0.9  # least upward part of a table's unit normal where x and y say where its edge is
 MOST_POINTS = 100_000  # most points of a file that are used; a shape is fitted to fewer
 CLOUD_HELP = "point cloud of one object (.ply, .pcd, .npy, .npz, or text as .xyz, .csv, .pts)"
@@ -107,6 +109,9 @@ class ViewOptions:
                 cloud = dataclasses.replace(cloud, normals=None)
             if self.camera_pose is not None:
                 pose = read_pose("--camera-pose", self.camera_pose)
+                with naming(camera_pose="--camera-pose"):
+                    pose = read_camera_pose(pose)
+                notes = (*notes, *tell_far(pose))
                 cloud = _move(name, cloud, pose)
                 table = table and table.moved(pose)
                 notes = tuple(note for note in notes if "default viewpoint" not in note)
@@ -235,6 +240,9 @@ def with_edge(table: Plane | float | None, edge: tuple[float, ...]) -> Plane:
         raise BadArgument("--edge", f"{len(edge)} numbers", wanted)
     numbers = check_tensor("--edge", real(edge), (len(edge),))
     point, outward = numbers.chunk(2)
+    if float(point.abs().max()) > FAR_EDGE:
+        far = f"a point {float(torch.linalg.vector_norm(point)):.4g} m from the frame's origin"
+        print_notes((f"--edge: {far}: its numbers are metres, also with --unit",))
     if not bool(outward.any()):
         wanted = "the direction away from the table"
         raise BadArgument("--edge", "a direction of length zero", wanted)
@@ -281,7 +289,13 @@ def read_region(name: str, text: str | None) -> Region | None:
             raise BadArgument(
                 "mesh", repr(text), "six numbers of a box, or the file of a closed mesh"
             )
-        return None if text is None else Region.box(numbers[:3], numbers[3:])
+        if text is None:
+            return None
+        sides = (numbers[3:] - numbers[:3]).abs()
+        if float(sides.min()) > MAX_EXTENT:
+            shown = " x ".join(f"{side:g}" for side in sides.tolist())
+            print_notes((f"{name}: a box of {shown} m: its numbers are metres, also with --unit",))
+        return Region.box(numbers[:3], numbers[3:])
 
 
 def read_distribution(name: str, text: str) -> float | Distribution:
