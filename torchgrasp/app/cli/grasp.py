@@ -340,7 +340,8 @@ class Grasp(ForPrograms):
             return None
         sure = 0.0 if math.isnan(plan.success) else plan.success
         found = f"{describe_best(stands)} where it stands, {describe_best(plan.grasps)} at the edge"
-        found += f", {sure:.0%} with the drag"
+        known = "success unknown" if math.isnan(plan.success) else f"{sure:.0%}"
+        found += f", {known} with the drag"
         better = rank_best(plan.grasps) >= 0 and sure > rank_best(stands)
         progress.end("drag", f"{found}: {'dragged to the edge' if better else 'it stays'}")
         return plan if better else None
