@@ -173,6 +173,15 @@ def as_plane(table: Plane | float | None) -> Plane | None:
     return Plane.horizontal(table)
 
 
+def faces_of(table: Plane | None) -> tuple[Plane, ...]:
+    """Return the planes at which a table ends: its top and, with an edge, its side; none without a
+    table.
+    """
+    if table is None:
+        return ()
+    return (table,) if table.edge is None else (table, table.edge)
+
+
 def upright_frame(
     points: Float[Tensor, "n 3"],
     viewpoint: Float[Tensor, "*v 3"] | None = None,

@@ -197,8 +197,7 @@ def level(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b"]:
     height = points @ table.normal.to(points)
     if table.edge is None:
         return height
-    beyond = points @ table.edge.normal.to(points) - table.edge.offset
-    return torch.maximum(height, table.offset + beyond)
+    return torch.maximum(height, table.offset + table.edge.height(points))
 
 
 def away(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b 3"]:
@@ -210,9 +209,8 @@ def away(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b 3"]:
     normal = table.normal.to(points).expand_as(points)
     if table.edge is None:
         return normal
-    height = points @ table.normal.to(points) - table.offset
-    beyond = points @ table.edge.normal.to(points) - table.edge.offset
-    return torch.where((beyond > height)[..., None], table.edge.normal.to(points), normal)
+    nearer = table.edge.height(points) > table.height(points)
+    return torch.where(nearer[..., None], table.edge.normal.to(points), normal)
 
 
 def table_clearance(
