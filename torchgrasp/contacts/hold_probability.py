@@ -46,7 +46,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import LEAST, Force, Length, Range, Seed, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import real
-from torchgrasp.geometry.linalg import dot, eye_like, norm, unit
+from torchgrasp.geometry.linalg import dot, eye_like, norm, perpendicular, unit
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values.distribution import Distribution, check_within
 from torchgrasp.values.planning import Contacts
@@ -262,9 +262,10 @@ class _Errors:
         arms = points - points.mean(2, keepdim=True)
         motion = self.placement * placed + self.shift * moved[:, None]
         motion = motion + self.turn * torch.linalg.cross(turned[:, None].expand_as(arms), arms)
-        tilted = self.tilt[..., None] * tilted
-        motion, tilted = (x - dot(x, normals, keepdim=True) * normals for x in (motion, tilted))
-        return points + motion, unit(normals + tilted), center + self.center * apart
+        # a contact stays on the surface, and a normal keeps its length
+        points = points + perpendicular(motion, normals)
+        normals = unit(normals + perpendicular(self.tilt[..., None] * tilted, normals))
+        return points, normals, center + self.center * apart
 
 
 @functools.lru_cache(maxsize=16)
@@ -393,8 +394,7 @@ def sensitivities(
     push = -dot(balance.forces, normals, keepdim=True)
     pressed = (balance.friction[:, None] * balance.press)[..., None] * balance.forces
     turned = pressed - push * balance.slide
-    moved, turned = (x - dot(x, normals, keepdim=True) * normals for x in (moved, turned))
-    return moved, turned
+    return perpendicular(moved, normals), perpendicular(turned, normals)
 
 
 def exceeding(
