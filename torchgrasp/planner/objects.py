@@ -251,22 +251,14 @@ class Objects:
         radius = float(self.hand.tips.radius.max())
         return iter(self.given_spec.relaxed(self.spec.ring_radius, radius))
 
-    def posed_again(
-        self,
-        request: Request,
-        hand: Hand,
-        spec: ContactSpec | None = None,
-        postures: int | None = None,
-        descends: bool = False,
-    ) -> "Objects":
-        """Return the same single object for another request, hand or contact constraints.
+    def relaxed(self, spec: ContactSpec) -> "Objects":
+        """Return the same single object with relaxed constraints, one of `relaxed_specs`.
 
-        `spec` holds constraints in the caller's frame, by default those of the request. `postures`
-        is the size of the posture library, None the default. `descends` is whether the hand may
-        move down while it closes.
+        The hand may then move down while it closes.
         """
         (object_,) = self.each
-        return pose(object_, request, hand, self.model, spec, postures, descends)
+        request = self.request
+        return pose(object_, request, self.hand, self.model, spec, self.postures, descends=True)
 
     def reach(
         self, contacts: Contacts, certificate: Certificate, cloud: CloudIndex

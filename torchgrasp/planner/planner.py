@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import join
+from torchgrasp.foundation.base import join, row_numbers
 from torchgrasp.ik.attempts import (
     Attempts,
     best_grasps,
@@ -81,6 +81,12 @@ def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:
         yield [dataclasses.replace(grasps, meta={"starts": str(planned)}) for grasps in ranked]
         if late:
             return
+
+
+def plan_object(objects: Objects, deadline: float) -> Iterator[Grasps]:
+    """Yield the grasps of each batch of the one object in `objects`, as `plan_objects` does."""
+    for (grasps,) in plan_objects(objects, deadline):
+        yield grasps
 
 
 def step(
@@ -186,7 +192,7 @@ def solve_with_sliding(
     """
     contacts, certificate, seeds = rows.select(now)
     attempts = Attempts(torch.ones_like(certificate.closed), executable)
-    attempts.add(rows.best(now), torch.arange(len(now), device=now.device))
+    attempts.add(rows.best(now), row_numbers(now))
     reach = objects.reach(contacts, certificate, rows.cloud[now])
     solve_sliding(objects.slide(rows.cloud[now]), reach, seeds, attempts)
     grasps, row = best_grasps(attempts)

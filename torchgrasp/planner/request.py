@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -105,6 +106,12 @@ class Request:
                 check_where(name, region, self._seen)
         if self.promise is not None and self.grasp_task.displaced:
             raise BadArgument("promise", f"{self.promise:g} for a displaced object", "None")
+
+    def deadline(self) -> float:
+        """Return the time of `time.monotonic` [s] after which no batch begins, if planning begins
+        now; infinite without a budget.
+        """
+        return math.inf if self.time_budget is None else time.monotonic() + self.time_budget
 
     def tell(self, stage: str, message: str, value: Any) -> None:
         """Report a stage to the observer, if there is one.
