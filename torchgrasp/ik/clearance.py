@@ -257,6 +257,7 @@ def clearance_rows(
     """
     pairs = spatial.hand.self_collision
     moves = spatial.hand.motion.moves
+    # the pairs of links that are nearest to each other
     separation, number, wrench = pairs.pushes(spatial.obj_from_link, SELF_CLEARANCE)
     count = min(HINGES, len(pairs.pairs))
     separation, index = separation.T.topk(count, dim=1, largest=False, sorted=False)
@@ -277,6 +278,7 @@ def sphere_rows(
     motion = spatial.hand.motion
     centres = spatial.sphere_centres
     radius = spheres.radius.to(centres)
+    # approximate clearances of all spheres from each part of the world tell which ones count
     found = []
     for field in world.fields:
         coarse = field.nearest_node(centres) - radius
@@ -291,7 +293,8 @@ def sphere_rows(
         return []
     count = min(HINGES, len(radius))
     coarse, index = torch.stack(found, 1).topk(count, dim=2, largest=False, sorted=False)
-    points = centres[row_numbers(centres)[:, None, None], index]
+    points = centres[row_numbers(centres)[:, None, None], index]  # (g, parts, k, 3)
+    # exact clearances of these, and the directions in which they grow
     clearance = []
     direction = []
     for k, field in enumerate(world.fields):
