@@ -338,8 +338,7 @@ class _PressSearch:
         """Return whether a hand presses with its pressing tips alone, and keeps clear of all else.
 
         The hand is in the posture with index `at` at a `pose` [m]. It comes down from above, and
-        moves with the object along the `way` [m], clear of the table and of the object's
-        neighbours.
+        moves with the object along the `way` [m]. Table and neighbours must not be in its way.
         """
         spheres = self.hand.collision_spheres
         pressing = flatnonzero(self.postures.presses[at])

@@ -2,8 +2,8 @@
 over.
 
 A fingertip cannot reach below an object that lies flat. So the hand presses on it from above, and
-drags it until a part hangs over the edge, while its centre of mass stays above the table. The
-fingers then pinch this part from above and below.
+drags it until a part hangs over the edge. Its centre of mass stays above the table. The fingers
+then pinch this part from above and below.
 """
 
 import dataclasses
@@ -45,9 +45,9 @@ class EdgePlan(Value):
             They are in the frame of the cloud, the best first, as those of `plan_grasps`. Their
             metadata hold the drag (`torchgrasp.planner.drag_of`), so that one file has both.
         shape: the estimated shape after the drag, in the same frame.
-        reason: why there is no drag: the object hangs over the edge far enough, or is too heavy, or
-            no posture of the hand can press on it, or a neighbour is in its way. Or the edge is too
-            far for what the camera saw of a scene. Empty if there is a drag.
+        reason: why there is no drag; empty if there is one. The object hangs over the edge far
+            enough, or is too heavy. Or no posture of the hand can press on it, or a neighbour is
+            in its way. Or the edge is too far for what the camera saw of a scene.
     """
 
     drag: DragPlan | None

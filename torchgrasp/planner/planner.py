@@ -94,8 +94,8 @@ def step(
 ) -> tuple[Candidates, Grasps, CloudIndex]:
     """Try at most `tried` further contact sets of each object, and return three results.
 
-    They are all contact sets `rows` with the results, the best grasps of those that ended now, and
-    the index of each grasp's object. `turn` is the number of the batch, from 1, and `last` says
+    The first are all contact sets `rows` with the results. The others are the best grasps of those
+    that ended now, and the index of each grasp's object. `turn` is the number of the batch, from 1, and `last` says
     whether it is the last one. In a mode other than "joint", `solve_all` solves for all sets, and
     `rows` stay unchanged.
     """
@@ -140,7 +140,7 @@ def try_fully(
     Return all contact sets `rows` with the results, then the indices of those that ended in this
     batch: those in `ended`, which ended earlier in it, and the new ones. A solved set ends
     (`Row.ENDED`); a failed one gets `Row.STUCK`. `solve_with_sliding` then tries stuck sets, and
-    ends them. It takes long. So in the `last` batch it tries all stuck sets, and in others only
+    ends them. It takes long. So in the `last` batch it tries all stuck sets. In others it tries
     those of objects without a grasp in this batch.
     """
     clouds = len(objects)
