@@ -331,12 +331,11 @@ def map_rows(
     axes: tuple[int | None, ...],
     arguments: tuple[Tensor, ...],
 ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    """Return the results of a function for all entries of an axis that torch.vmap maps over, as the
-    `vmap` of a torch.autograd.Function does.
+    """Return the results of a function of rows where torch.vmap maps over it, and their axes.
 
-    The rows of all entries are computed together. `size` is the number of entries, and `axes` are
-    their axes in the `arguments`; None means the same argument for all. In the results the axis is
-    0.
+    It serves as `vmap` of a torch.autograd.Function. The rows of all mapped entries are computed
+    together. `size` is the number of entries, and `axes` are their axes in the `arguments`; None
+    means the same argument for all. In the results the axis is 0.
     """
     parts = [
         x.expand(size, *x.shape) if axis is None else x.movedim(axis, 0)
