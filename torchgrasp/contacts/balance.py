@@ -138,8 +138,10 @@ def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"
 def split_forces(
     forces: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*c f 3"]
 ) -> tuple[Float[Tensor, "*d f"], Float[Tensor, "*d f 3"]]:
-    """Return the normal parts of forces on an object with the outward unit `normals`, positive if
-    they push, then the tangential parts.
+    """Return the normal parts of forces on an object, positive if they push, then the tangential
+    parts.
+
+    `normals` are the outward unit normals of the object where the forces act.
     """
     push = -dot(forces, normals)
     return push, forces + push[..., None] * normals
