@@ -307,7 +307,7 @@ class _PressSearch:
         steady = _is_steady(postures, turns.mT @ outward)  # (p, t)
         turned = (turns @ postures.feet[:, None].mT).mT  # (p, t, f, 3)
         presses = postures.presses[:, None]  # (p, 1, f)
-        # at the end of the drag the tips are still over the table
+        # places that are still over the table at the end of the drag
         centre = self.balance.centre
         edge = self.balance.edge
         most = self.balance.behind - DRAG.supported
@@ -315,18 +315,19 @@ class _PressSearch:
         places = self.top.places(stands, centre)
         places = places[(places - centre) @ edge <= most][: DRAG.places]
         for place in places:
+            # two tips far apart resist a turn, or one on a line with the centre of mass
             off = abs(float((centre - place) @ sideways))
             if tips == 1 and off > DRAG.pivot:
                 continue
             straight = self.lever * off <= postures.apart
+            # each pressing tip ends over the table, and stands on a flat top at the same height
             feet = turned + place
             ahead = ((feet - centre) @ edge).where(presses, -math.inf).amax(2)
             height, flat = self.top.look(stands, feet[..., :2])
             low = height.where(presses, math.inf).amin(2)
             high = height.where(presses, -math.inf).amax(2)
             good = straight[:, None] & steady & (flat | ~presses).all(2)
-            good &= high - low <= DRAG.flat
-            good &= ahead <= most
+            good &= (high - low <= DRAG.flat) & (ahead <= most)
             for p, t in torch.nonzero(good).tolist():
                 at = int(rows[p])
                 pose = rigid(turns[t], torch.stack([place[0], place[1], high[p, t]]))
