@@ -115,7 +115,7 @@ def test_bounds_name_ball_separation_and_table(ellipsoid, generator, fingertips)
         ((lowest < 0.47) & (height > 0.47)).any()
     )
     paper = ContactProblem.of(ellipsoid, ContactSpec.paper())
-    assert paper.up is None
+    assert not paper.table
     assert paper.separation == LEAST_SIDE
 
 

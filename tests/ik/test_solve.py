@@ -10,7 +10,7 @@ from torchgrasp import Contacts, load_hand, load_mixture, sample_configurations,
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
 from torchgrasp.ik import CollisionWorld, PostureLibrary
-from torchgrasp.ik.attempts import refine_by_cobyla
+from torchgrasp.ik.cobyla import refine_by_cobyla
 from torchgrasp.ik.configuration import Configuration
 
 

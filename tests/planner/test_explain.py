@@ -302,10 +302,10 @@ def test_a_thing_that_no_hand_holds_is_explained_with_few_plans_and_twice_alike(
     monkeypatch.setattr("torchgrasp.planner.explain.EXPLAIN", ExplainNumbers(trials=1))
     plans = []
     heard = []
-    run = explain.plan_objects
+    run = explain.plan_object
     monkeypatch.setattr(
         explain,
-        "plan_objects",
+        "plan_object",
         lambda objects, *given: plans.append(objects) or run(objects, *given),
     )
     cloud = ball(radius=0.14, centre=(0.0, 0.0, 0.14))

@@ -25,11 +25,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.contacts.form_closure import Vectors, centre_and_radius, solve_closure_lp, wrenches
+from torchgrasp.contacts.form_closure import (
+    Vectors,
+    centre_and_radius,
+    count_contacts,
+    solve_closure_lp,
+    wrenches,
+)
 from torchgrasp.contacts.problem import Tensions, contact_pairs, pull_signs
-from torchgrasp.foundation.base import FINGERTIPS, row_numbers
+from torchgrasp.foundation.base import row_numbers
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, Positive
 from torchgrasp.geometry.frames import skew
 from torchgrasp.geometry.linalg import (
@@ -130,6 +135,18 @@ def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"
     return signs[..., None] * sides[..., None, :]
 
 
+def split_forces(
+    forces: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*c f 3"]
+) -> tuple[Float[Tensor, "*d f"], Float[Tensor, "*d f 3"]]:
+    """Return the normal parts of forces on an object, positive if they push, then the tangential
+    parts.
+
+    `normals` are the outward unit normals of the object where the forces act.
+    """
+    push = -dot(forces, normals)
+    return push, forces + push[..., None] * normals
+
+
 def tangential_ratio(
     forces: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b f"]:
@@ -138,9 +155,8 @@ def tangential_ratio(
     `forces` act on the object, whose outward unit normals are `normals`. The ratio is infinite
     where a force does not push.
     """
-    push = -dot(forces, normals)
-    tangential = norm(forces + push[..., None] * normals)
-    ratio = tangential / push.clamp_min(BALANCE.pushing)
+    push, slide = split_forces(forces, normals)
+    ratio = norm(slide) / push.clamp_min(BALANCE.pushing)
     return torch.where(push > 0, ratio, torch.inf)
 
 
@@ -174,9 +190,7 @@ def least_friction_forces(
     >>> least_friction_forces(points, normals, 2.0)[0, :, 0].round(decimals=2)
     tensor([ 1.,  1., -2.])
     """
-    f = points.shape[-2]
-    if not FINGERTIPS[0] <= f <= FINGERTIPS[1]:
-        raise BadArgument("points", f"{f} contacts a set", "3 to 5 contacts")
+    f = count_contacts(points)
     p = points.double().reshape(-1, f, 3)
     n = normals.double().reshape(-1, f, 3)
     if preferred is not None:
@@ -207,8 +221,7 @@ def _search_forces(
     length = dot(sides, sides, keepdim=True) ** 0.5
     signs = pull_signs(3, points.device).T  # (p, f)
     basis = signs[..., None] * (sides / length)[:, :, None]
-    push = -dot(basis, normals[:, None])
-    slide = basis + push[..., None] * normals[:, None]
+    push, slide = split_forces(basis, normals[:, None])
     slide = slide.reshape(-1, 3, 9).swapaxes(1, 2)
     push = push.swapaxes(1, 2)  # (b, 3, 3): normal force at each contact by each push
     start = torch.zeros_like(push[:, 0])
@@ -227,10 +240,9 @@ def forces_near(points: Vectors, normals: Vectors, weights: Tensions) -> Vectors
     forces push at all contacts.
     """
     pairs = internal_forces(points)
-    push = -dot(pairs, normals[:, None])
-    slide = (pairs + push[..., None] * normals[:, None]).flatten(2)
+    push, slide = split_forces(pairs, normals[:, None])
     steps = _near_steps(weights.shape[1], push.device)
-    weights, found = _improve(push.mT, slide.mT, weights, steps, None)
+    weights, found = _improve(push.mT, slide.flatten(2).mT, weights, steps, None)
     forces = torch.einsum("bp,bpfi->bfi", weights, pairs)
     return torch.where(found[:, None, None], forces, torch.nan)
 

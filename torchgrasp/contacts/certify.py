@@ -27,7 +27,7 @@ from torchgrasp.contacts.form_closure import (
     solve_closure_lp,
     wrenches,
 )
-from torchgrasp.foundation.base import FINGERTIPS, flatnonzero
+from torchgrasp.foundation.base import FINGERTIPS, flatnonzero, map_rows
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import is_known
@@ -172,13 +172,7 @@ class _Proof(torch.autograd.Function):
         info: Any, in_dims: tuple[int | None, ...], *args: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         """Prove together the contact sets of all entries of the mapped axis."""
-        rows = []
-        for x, axis in zip(args, in_dims, strict=True):
-            same = axis is None  # for all values
-            rows.append(x.expand(info.batch_size, *x.shape) if same else x.movedim(axis, 0))
-        proof = _Proof.apply(*(x.flatten(0, 1) for x in rows))
-        size = rows[0].shape[:2]
-        return tuple(x.unflatten(0, size) for x in proof), (0,) * len(proof)
+        return map_rows(_Proof.apply, info.batch_size, in_dims, args)
 
 
 class _Once(torch.autograd.Function):

@@ -29,10 +29,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.contacts.balance import grasp_map
-from torchgrasp.contacts.form_closure import Vectors, scaled_arms, with_torque
-from torchgrasp.foundation.base import FINGERTIPS, flatnonzero, row_numbers
+from torchgrasp.contacts.form_closure import Vectors, count_contacts, scaled_arms, with_torque
+from torchgrasp.foundation.base import FINGERTIPS, flatnonzero, map_rows, row_numbers
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
@@ -132,9 +131,7 @@ def critical_friction(
     >>> f"{float(critical_friction(points, normals)):.3f}"
     '0.750'
     """
-    f = points.shape[-2]
-    if not FINGERTIPS[0] <= f <= FINGERTIPS[1]:
-        raise BadArgument("points", f"{f} contacts a set", "3 to 5 contacts")
+    f = count_contacts(points)
     flat = points.reshape(-1, f, 3).double()
     rows, found = least_balance(flat, normals.reshape(-1, f, 3).double())
     needed = torch.where(found.friction.isnan(), torch.inf, found.friction)
@@ -233,13 +230,7 @@ class _Search(torch.autograd.Function):
         info: Any, in_dims: tuple[int | None, ...], *args: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         """Search together for the balances of all entries of the mapped axis."""
-        rows = [
-            x.expand(info.batch_size, *x.shape) if axis is None else x.movedim(axis, 0)
-            for x, axis in zip(args, in_dims, strict=True)
-        ]
-        found = _Search.apply(*(x.flatten(0, 1) for x in rows))
-        size = rows[0].shape[:2]
-        return tuple(x.unflatten(0, size) for x in found), (0,) * len(found)
+        return map_rows(_Search.apply, info.batch_size, in_dims, args)
 
 
 def _search(

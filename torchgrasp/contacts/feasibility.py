@@ -43,6 +43,8 @@ JUDGED_POINTS = 8
 GUIDING_POINTS = 4
 # share of the largest variation that guiding points allow: the judged points lie between them
 INSIDE = 0.95
+BORDER = -1e-9  # signed distance (normalised) inside of which a point is in a region: rounding
+ON_SURFACE = 1e-6  # largest |f_d| of a contact on the surface, normalised: far above rounding
 
 
 def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b f n 3"]:
@@ -154,10 +156,6 @@ def _wall_constraint(
     over = chord - 2 * math.sin(INSIDE * flatness / 2)
     value = spread(radius, points[:, 0]) * over.flatten(1)
     return FlatnessConstraint(value, by_points, points)
-
-
-BORDER = -1e-9  # signed distance (normalised) inside of which a point is in a region: rounding
-ON_SURFACE = 1e-6  # largest |f_d| of a contact on the surface, normalised: far above rounding
 
 
 def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors) -> ContactPlan:

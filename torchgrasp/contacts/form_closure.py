@@ -25,9 +25,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import at_once, flatnonzero, in_chunks
+from torchgrasp.foundation.base import FINGERTIPS, at_once, flatnonzero, in_chunks
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import degenerate, subsets
-from torchgrasp.geometry.linalg import dot, eye_like, matvec, norm, unit
+from torchgrasp.geometry.linalg import dot, eye_like, matvec, norm, perpendicular, unit
 from torchgrasp.shape.kernel import is_plain
 
 Vectors = Float[Tensor, "b f 3"]  # points or normals of the contacts in every row
@@ -55,6 +56,14 @@ GRASPS_PER_CHUNK = 2048  # grasps at a time: their tableaux stay in the cache
 PARALLEL = 1e-9  # planar wrenches (of length about 1) with a shorter cross product are parallel
 FIRST_EDGES = 4  # edges of a cone in the first programme
 ROUNDS = 12  # most programmes: more make hardly a verdict sharper
+
+
+def count_contacts(points: Float[Tensor, "*b f 3"]) -> int:
+    """Return the number f of contacts of each set; raise `BadArgument` unless it is 3 to 5."""
+    f = points.shape[-2]
+    if not FINGERTIPS[0] <= f <= FINGERTIPS[1]:
+        raise BadArgument("points", f"{f} contacts a set", "3 to 5 contacts")
+    return f
 
 
 def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
@@ -104,8 +113,7 @@ def tangents(points: Vectors, normals: Vectors) -> Vectors:
     axis = eye_like(3, normals)[smallest]
     stand_in = torch.linalg.cross(axis, normals)
     if points.shape[1] > 3:
-        away = points[:, None] - points[:, :, None]
-        away = away - dot(away, outward, keepdim=True) * outward
+        away = perpendicular(points[:, None] - points[:, :, None], outward)
         far, farthest = norm(away).max(-1, keepdim=True)
         distinct = far**2 > SEAM * size
         stand_in = torch.where(distinct, _take(away, farthest), stand_in)

@@ -8,9 +8,9 @@ contacts that move by u_i and normals that turn by w_i, both along the surface, 
 
 with the symbols of `torchgrasp.contacts.critical`, of the twist y only the rotation, and the
 root-mean-square radius r of the contacts. An object that is displaced by v, and turned by z about
-the centroid of its contacts p_i, moves all contacts together: u_i is the part of v + z x (p_i - p)
-along the surface, with the centroid p. Under a weight w, whose centre of mass is c, a change of the
-mass by the share e and of the centre by d changes mu_c by
+the centroid p of its contacts p_i, moves all contacts together. Then u_i is the part of
+v + z x (p_i - p) along the surface. Under a weight w, a change of the mass by the share e and of
+the centre of mass by d changes mu_c by
 
     e y . w + (w_f x y / r) . d,    w_f the force of w.
 
@@ -46,7 +46,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import LEAST, Force, Length, Range, Seed, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import real
-from torchgrasp.geometry.linalg import dot, eye_like, norm, unit
+from torchgrasp.geometry.linalg import dot, eye_like, norm, perpendicular, unit
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values.distribution import Distribution, check_within
 from torchgrasp.values.planning import Contacts
@@ -182,11 +182,8 @@ def hold_probability(
     points = check_contacts(contacts).points.double()
     normals = check_unit(contacts.normals.double())
     check_within("friction", friction, FRICTIONS)
-    center = points.new_zeros(len(points), 3)
-    apart = 0.0
-    if weight is not None:
-        center = _center(weight, points)
-        apart = weight.center_std
+    center = points.new_zeros(len(points), 3) if weight is None else _center(weight, points)
+    apart = 0.0 if weight is None else weight.center_std
     errors = _Errors(placement, _tilts(tilt, points)[:, None], shift, turn, apart)
     points, normals, center = (x[:, None] for x in (points, normals, center))
     certain = not isinstance(tilt, Tensor) and placement == tilt == shift == turn == apart == 0
@@ -201,6 +198,7 @@ def hold_probability(
         each = missed[..., None, None]
         points = torch.where(each, points, touched)
         normals = torch.where(each, normals, slopes.to(points))
+    # the errors that count to first order are those around the fixed ones
     if not certain:
         points, normals, center = errors.displaced(points, normals, center, count)
         errors = errors.times(HOLD.local)
@@ -262,9 +260,10 @@ class _Errors:
         arms = points - points.mean(2, keepdim=True)
         motion = self.placement * placed + self.shift * moved[:, None]
         motion = motion + self.turn * torch.linalg.cross(turned[:, None].expand_as(arms), arms)
-        tilted = self.tilt[..., None] * tilted
-        motion, tilted = (x - dot(x, normals, keepdim=True) * normals for x in (motion, tilted))
-        return points + motion, unit(normals + tilted), center + self.center * apart
+        # a contact stays on the surface, and a normal keeps its length
+        points = points + perpendicular(motion, normals)
+        normals = unit(normals + perpendicular(self.tilt[..., None] * tilted, normals))
+        return points, normals, center + self.center * apart
 
 
 @functools.lru_cache(maxsize=16)
@@ -283,8 +282,10 @@ def _spread_evenly(count: int, numbers: int) -> list[list[float]]:
 
 @dataclasses.dataclass(frozen=True)
 class _Burden:
-    """A weight: the force over the mean normal force, the centre of mass [m] of each contact set,
-    and the standard deviation of the mass over the mass.
+    """A weight that contacts carry.
+
+    `force` is over the mean normal force, and `center` [m] is the centre of mass for each contact
+    set. `of_mass` is the standard deviation of the mass over the mass.
     """
 
     force: Float[Tensor, "3"]
@@ -393,8 +394,7 @@ def sensitivities(
     push = -dot(balance.forces, normals, keepdim=True)
     pressed = (balance.friction[:, None] * balance.press)[..., None] * balance.forces
     turned = pressed - push * balance.slide
-    moved, turned = (x - dot(x, normals, keepdim=True) * normals for x in (moved, turned))
-    return moved, turned
+    return perpendicular(moved, normals), perpendicular(turned, normals)
 
 
 def exceeding(

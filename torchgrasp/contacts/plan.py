@@ -33,9 +33,8 @@ most steps.
 
 The two kinds of stages alternate, because each goes on where the other is stuck.
 """
-TO_CENTRE = (
-    Stage(0.3, 3.0, 8, exact=False),
-)  # from candidates, most of which are feasible but for rounding
+# from candidates, most of which are feasible but for rounding
+TO_CENTRE = (Stage(0.3, 3.0, 8, exact=False),)
 # fewest starts at a time under a time budget: with less, the overhead of each step outweighs them
 LEAST_STARTS = 25
 

@@ -16,7 +16,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -25,7 +25,7 @@ from torch import Tensor
 from torchgrasp.contacts.form_closure import Vectors
 from torchgrasp.foundation.base import FINGERTIPS, Batch, map_tensors, spread
 from torchgrasp.geometry.linalg import dot, eye_like, norm
-from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.plane import Plane, faces_of
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.estimate import MeanJet, SurfaceJet
 from torchgrasp.values.specs import ContactSpec
@@ -271,6 +271,41 @@ def forces_from_tensions(
 Bounds = tuple[Float[Tensor, "b k"], Float[Tensor, "b k u"]]
 
 
+class Face(NamedTuple):
+    """A plane at which a table ends, in normalised units.
+
+    `outward` is its unit normal, away from the table, and `offset` its distance from the origin.
+    """
+
+    outward: Float[Tensor, "3"]
+    offset: PerRow
+
+    @classmethod
+    def of(cls, plane: Plane, shape: ShapeLike) -> "Face":
+        """Return a plane [m] in the units of a shape, or of each shape of a batch."""
+        outward = plane.normal.to(device_of(shape))
+        foot = plane.offset * plane.normal
+        scale = shape.scale
+        if isinstance(scale, Tensor):
+            feet = shape.normalise(foot.to(scale).expand(len(scale), 3))
+            return cls(outward, feet @ outward)
+        return cls(outward, float(shape.normalise(foot) @ plane.normal))
+
+    def rows(self, index: Int[Tensor, "k"]) -> "Face":
+        """Return the face in the units of the contact sets with the indices `index`."""
+        offset = self.offset
+        return Face(self.outward, offset[index]) if isinstance(offset, Tensor) else self
+
+    def room(
+        self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], tip_radius: PerRow
+    ) -> Float[Tensor, "*b"]:
+        """Return how far (normalised) the round fingertip on each contact is from the face."""
+        away = self.outward.to(points)
+        height = points @ away
+        slant = 1 - normals @ away
+        return height - spread(self.offset, height) - spread(tip_radius, slant) * slant
+
+
 @dataclasses.dataclass(frozen=True)
 class ContactProblem:
     """The contact planning problem, Eqs. (10)-(14) of the paper, in normalised units.
@@ -279,11 +314,10 @@ class ContactProblem:
     constraints in metres; all else is normalised. `friction` is the coefficient of the largest
     round cone inside the friction cone with flat sides that `certify` uses. `domain_radius` is that
     of the shape. `separation` is the least distance of two fingertip centres, `tip_radius` the
-    radius of the fingertips, and `ring` the radius within which the surface is flat. The table has
-    the unit normal `up` (None without a table) and the distance `floor` from the origin. Its edge
-    has the unit normal `outward` (None without an edge) and the distance `brink`. `beyond` returns
-    the signed distance (q,) of normalised points (q, 3) from the region where contacts may be,
-    negative inside.
+    radius of the fingertips, and `ring` the radius within which the surface is flat. `table` are
+    the faces of the table: none without a table, its top, and its side if it has an edge. `beyond`
+    returns the signed distance (q,) of normalised points (q, 3) from the region where contacts may
+    be, negative inside.
     """
 
     spec: ContactSpec
@@ -292,11 +326,8 @@ class ContactProblem:
     separation: PerRow
     tip_radius: PerRow
     ring: PerRow
-    up: Float[Tensor, "3"] | None
-    floor: PerRow
+    table: tuple[Face, ...]
     beyond: Callable[[Tensor], Tensor] | None = None
-    outward: Float[Tensor, "3"] | None = None
-    brink: PerRow = 0.0
 
     @classmethod
     def of(
@@ -307,11 +338,8 @@ class ContactProblem:
         `ring_radius` [m] is the radius within which the surface must be flat; by default that of
         the spec.
         """
-        table = spec.plane
         sizes = shape.scale, shape.domain_radius
         scale, radius = (x if isinstance(x, Tensor) else float(x) for x in sizes)
-        up, floor = _normalised(shape, table)
-        outward, brink = _normalised(shape, None if table is None else table.edge)
         separation = spec.least_separation / scale
         if isinstance(separation, Tensor):
             separation = separation.clamp_min(LEAST_SIDE)
@@ -328,18 +356,18 @@ class ContactProblem:
             separation,
             spec.fingertip_radius / scale,
             ring,
-            up,
-            floor,
+            tuple(Face.of(plane, shape) for plane in faces_of(spec.plane)),
             beyond,
-            outward,
-            brink,
         )
 
     def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
         """Return the problem of the k contact sets with the indices `index`."""
-        names = "domain_radius", "separation", "tip_radius", "ring", "floor", "brink"
+        names = "domain_radius", "separation", "tip_radius", "ring"
         own = {name: x[index] for name in names if isinstance(x := getattr(self, name), Tensor)}
-        return dataclasses.replace(self, **own) if own else self
+        if not own:  # of one shape for all contact sets
+            return self
+        table = tuple(face.rows(index) for face in self.table)
+        return dataclasses.replace(self, table=table, **own)
 
     def room(
         self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]
@@ -351,43 +379,29 @@ class ContactProblem:
         result is how far it is beyond the edge. `points` are normalised, `normals` outward unit
         normals.
         """
-        if self.up is None:
+        rooms = [face.room(points, normals, self.tip_radius) for face in self.table]
+        if not rooms:
             return torch.full_like(points[..., 0], math.inf)
-        height = self._room(points, normals, self.up, self.floor)
-        if self.outward is None:
-            return height
-        return torch.maximum(height, self._room(points, normals, self.outward, self.brink))
+        return functools.reduce(torch.maximum, rooms)
 
-    def _room(
-        self,
-        points: Float[Tensor, "*b 3"],
-        normals: Float[Tensor, "*b 3"],
-        away: Float[Tensor, "3"],
-        offset: PerRow,
-    ) -> Float[Tensor, "*b"]:
-        """Return how far (normalised) each fingertip is from the plane with the unit normal `away`
-        and the `offset`.
-        """
-        away = away.to(points)
-        height = points @ away
-        slant = 1 - normals @ away
-        return height - spread(offset, height) - spread(self.tip_radius, slant) * slant
-
-    def _room_slope(
+    def _room_and_slope(
         self, points: Vectors, normals: Vectors, centre_by_point: Float[Tensor, "b f 3 3"]
-    ) -> Vectors:
-        """Return the derivatives of the `room` of each contact by its point.
+    ) -> tuple[Float[Tensor, "b f"], Vectors]:
+        """Return the `room` of each contact, and its derivatives by the contact's point.
 
-        `centre_by_point` are those of its fingertip's centre.
+        `centre_by_point` are those of its fingertip's centre. There must be a table.
         """
-        assert self.up is not None
-        slope = self.up.to(points) @ centre_by_point
-        if self.outward is None:
-            return slope
-        height = self._room(points, normals, self.up, self.floor)
-        beyond = self._room(points, normals, self.outward, self.brink)
-        sideways = self.outward.to(points) @ centre_by_point
-        return torch.where((beyond > height)[..., None], sideways, slope)
+        (room, slope), *others = [
+            (
+                face.room(points, normals, self.tip_radius),
+                face.outward.to(points) @ centre_by_point,
+            )
+            for face in self.table
+        ]
+        for beyond, sideways in others:
+            slope = torch.where((beyond > room)[..., None], sideways, slope)
+            room = torch.maximum(room, beyond)
+        return room, slope
 
     def sides(
         self, points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]
@@ -429,9 +443,10 @@ class ContactProblem:
             beyond_by_x,
             distances_by_x,
         ]
-        if self.up is not None:
-            values.append((1 - INSIDE) * ROOM - self.room(points, jet.normals))
-            jacobians.append(own(-self._room_slope(points, jet.normals, centre_by_point)))
+        if self.table:
+            room, slope = self._room_and_slope(points, jet.normals, centre_by_point)
+            values.append((1 - INSIDE) * ROOM - room)
+            jacobians.append(own(-slope))
         if self.beyond is not None:
             value, slope = self._outside(points)
             values.append((1 - INSIDE) * ROOM + value)
@@ -499,20 +514,6 @@ class ContactProblem:
         cosine = 1 / math.sqrt(1 + self.friction**2)
         excess = outward[..., 0] + cosine + CONE_MARGIN
         return excess, torch.cat([blocks.flatten(2), by_tension], 2)
-
-
-def _normalised(shape: ShapeLike, plane: Plane | None) -> tuple[Float[Tensor, "3"] | None, PerRow]:
-    """Return the unit normal of a plane, and its distance (normalised) from the origin; None and 0
-    without a plane.
-    """
-    if plane is None:
-        return None, 0.0
-    normal = plane.normal.to(device_of(shape))
-    foot = plane.offset * plane.normal
-    scale = shape.scale
-    if isinstance(scale, Tensor):
-        return normal, shape.normalise(foot.to(scale).expand(len(scale), 3)) @ normal
-    return normal, float(shape.normalise(foot) @ plane.normal)
 
 
 def _by_own_point(slope: Vectors, unknowns: int) -> Float[Tensor, "b f u"]:

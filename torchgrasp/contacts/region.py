@@ -150,9 +150,8 @@ class Region(Value):
             raise BadArgument("mask", f"{int(mask.sum())} pixels of {tuple(mask.shape)}", wanted)
         inside = np.pad(mask.cpu().numpy(), 1)  # what lies beyond the border is outside
         outward, inward = (np.asarray(ndimage.distance_transform_edt(x)) for x in (~inside, inside))
-        pixels = np.where(
-            inside, 0.5 - inward, outward - 0.5
-        )  # from the middle of a pixel to a border
+        # from the middle of a pixel to a border
+        pixels = np.where(inside, 0.5 - inward, outward - 0.5)
         k = image.intrinsics.double().cpu().numpy()
         camera = inverse(image.obj_from_camera.double()).cpu()
         focal = np.diag(k)[:2]
@@ -201,11 +200,9 @@ def combine(
         for name, x, k in named
         if x is not None
     ]
-    return (
-        Region(lambda x: functools.reduce(torch.maximum, (k * part(x) for part, k in parts)))
-        if parts
-        else None
-    )
+    if not parts:
+        return None
+    return Region(lambda x: functools.reduce(torch.maximum, (k * part(x) for part, k in parts)))
 
 
 def seen_from(region: Distance | None, obj_from_frame: Float[Tensor, "4 4"]) -> Distance | None:
@@ -213,8 +210,6 @@ def seen_from(region: Distance | None, obj_from_frame: Float[Tensor, "4 4"]) -> 
 
     `obj_from_frame` is the transform from that frame. None stays None.
     """
-    return (
-        None
-        if region is None
-        else lambda points: region(apply(obj_from_frame.to(points), points.reshape(-1, 3)))
-    )
+    if region is None:
+        return None
+    return lambda points: region(apply(obj_from_frame.to(points), points.reshape(-1, 3)))

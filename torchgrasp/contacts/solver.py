@@ -41,12 +41,10 @@ from torchgrasp.shape.surface import newton_step
 # least and greatest damping
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e9
-LONGEST_STEP = (
-    0.3  # a point moves at most this far in a step (normalised): there the surface is smooth
-)
-TENSION_DAMPING = (
-    0.1  # damping of the tensions relative to that of the points: tensions may change faster
-)
+# a point moves at most this far in a step (normalised): there the surface is smooth
+LONGEST_STEP = 0.3
+# damping of the tensions relative to that of the points: tensions may change faster
+TENSION_DAMPING = 0.1
 # weight of the surface: a step off it would be undone by the projection, which the cones then
 # resist
 SURFACE = 10.0
@@ -69,9 +67,8 @@ class Stage:
     exact: bool = True
 
 
-FINISH = Stage(
-    centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False
-)  # the last stage, feasibility alone
+# the last stage, feasibility alone
+FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False)
 
 
 @dataclasses.dataclass(frozen=True)

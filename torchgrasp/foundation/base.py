@@ -19,10 +19,8 @@ from torchgrasp.foundation.errors import BadArgument, FailedRows, Status
 from torchgrasp.foundation.rules import Range, check_moved, show
 from torchgrasp.foundation.settings import usual_settings
 
-FINGERTIPS = (
-    3,
-    5,
-)  # fewest and most fingertips on an object: two contacts do not resist a rotation about their line
+# fewest and most fingertips on an object: two contacts do not resist a rotation about their line
+FINGERTIPS = (3, 5)
 # columns and lines of the text of a value
 WIDTH = 110
 LINES = 12
@@ -58,9 +56,8 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
     fields = {name: merge(name, *(getattr(value, name) for value in values)) for name in names}
     if hasattr(kind, "__post_init__"):
         return kind(**fields)
-    new = object.__new__(
-        kind
-    )  # checked fields need no second check, and loops make thousands of values
+    # checked fields need no second check, and loops make thousands of values
+    new = object.__new__(kind)
     new.__dict__.update(fields)
     return new
 
@@ -167,11 +164,9 @@ def _digest(value: Any) -> int:
         return hash((value.shape, *flat[:: max(1, len(flat) // some)].nan_to_num().tolist()))
     if isinstance(value, dict):
         return hash(frozenset((key, _digest(x)) for key, x in value.items()))
-    return hash(
-        tuple(map(_digest, value))
-        if isinstance(value, tuple | list)
-        else not _is_nan(value) and value
-    )
+    if isinstance(value, tuple | list):
+        return hash(tuple(map(_digest, value)))
+    return hash(not _is_nan(value) and value)
 
 
 def _is_nan(value: Any) -> bool:
@@ -220,9 +215,8 @@ class Batch(Value):
         Raises `BadArgument` for an index of another kind, such as a single boolean, and
         `IndexError` beyond the last row.
         """
-        chosen = read_rows(
-            rows, len(self)
-        )  # once for all tensors: on a GPU the host waits for the number of rows
+        # once for all tensors: on a GPU the host waits for the number of rows
+        chosen = read_rows(rows, len(self))
         return map_tensors(lambda x: x[chosen], self)
 
     def __iter__(self: SomeBatch) -> Iterator[SomeBatch]:
@@ -331,6 +325,27 @@ def in_chunks(
     return tuple(map(torch.cat, zip(*map(evaluate, x.split(size)), strict=True)))
 
 
+def map_rows(
+    function: Callable[..., tuple[Tensor, ...]],
+    size: int,
+    axes: tuple[int | None, ...],
+    arguments: tuple[Tensor, ...],
+) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    """Return the results of a function of rows where torch.vmap maps over it, and their axes.
+
+    It serves as `vmap` of a torch.autograd.Function. The rows of all mapped entries are computed
+    together. `size` is the number of entries, and `axes` are their axes in the `arguments`; None
+    means the same argument for all. In the results the axis is 0.
+    """
+    parts = [
+        x.expand(size, *x.shape) if axis is None else x.movedim(axis, 0)
+        for x, axis in zip(arguments, axes, strict=True)
+    ]
+    found = function(*(x.flatten(0, 1) for x in parts))
+    rows = parts[0].shape[1]
+    return tuple(x.unflatten(0, (size, rows)) for x in found), (0,) * len(found)
+
+
 def row_numbers(rows: Tensor) -> Int[Tensor, "n"]:
     """Return the integers 0 to n - 1 for the n rows of a tensor, on its device."""
     return torch.arange(len(rows), device=rows.device)
@@ -386,11 +401,8 @@ def settle(value: SomeValue, device: torch.device) -> SomeValue:
     """Return a value on a device; a value that is already there is returned itself, with its
     caches.
     """
-    return (
-        value
-        if all(x.device == device for x in named_tensors(value).values())
-        else value.to(device)
-    )
+    there = all(x.device == device for x in named_tensors(value).values())
+    return value if there else value.to(device)
 
 
 def check_device(name: str, found: torch.device, beside: str, wanted: torch.device) -> None:

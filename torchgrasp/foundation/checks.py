@@ -15,7 +15,7 @@ import inspect
 import threading
 import types
 import typing
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, overload
@@ -49,6 +49,7 @@ from torchgrasp.foundation.rules import (
     show,
 )
 from torchgrasp.foundation.settings import DEVICES, in_autocast, usual_settings
+from torchgrasp.foundation.threads import each_within
 
 Checked = TypeVar("Checked", bound=Callable[..., Any])
 _thread = threading.local()  # `inside` is True while this thread is in a checked function
@@ -169,26 +170,24 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
             result = function(*bound.args, **bound.kwargs)
         finally:
             _thread.inside = inside
-        return _each(result) if not inside and inspect.isgenerator(result) else result
+        if not inside and inspect.isgenerator(result):
+            return each_within(result, _unchecked)
+        return result
 
     setattr(call, "__checked__", True)  # noqa: B010
     return call
 
 
-def _each(items: Generator[Any, Any, Any]) -> Iterator[Any]:
-    """Yield the items of a generator, whose own calls of the library are not checked."""
-    with contextlib.closing(items):
-        while True:
-            inside = getattr(_thread, "inside", False)
-            _thread.inside = True
-            try:
-                with usual_settings():
-                    item = next(items)
-            except StopIteration:
-                return
-            finally:
-                _thread.inside = inside
-            yield item
+@contextlib.contextmanager
+def _unchecked() -> Iterator[None]:
+    """Within the context, calls of this thread are the library's own, in its settings of torch."""
+    inside = getattr(_thread, "inside", False)
+    _thread.inside = True
+    try:
+        with usual_settings():
+            yield
+    finally:
+        _thread.inside = inside
 
 
 def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
@@ -268,15 +267,15 @@ def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> An
         return value
     if mark == ANY and not call.strict:
         call = dataclasses.replace(call, finite={})
-    result = _read(
-        name, value, hint, dataclasses.replace(call, strict=True) if mark == FINITE else call
-    )
+    inner = dataclasses.replace(call, strict=True) if mark == FINITE else call
+    result = _read(name, value, hint, inner)
     if mark == RIGID:
         call.rigid[name] = result
-    if isinstance(mark, Rows) and (
-        wanted := call.sizes.setdefault(mark.letter, len(result))
-    ) != len(result):
-        raise BadArgument(name, f"{len(result)} rows", f"{wanted} rows, as many as the others have")
+    if isinstance(mark, Rows):
+        wanted = call.sizes.setdefault(mark.letter, len(result))
+        if len(result) != wanted:
+            allowed = f"{wanted} rows, as many as the others have"
+            raise BadArgument(name, f"{len(result)} rows", allowed)
     return result
 
 
@@ -298,11 +297,9 @@ def _read_union(name: str, value: Any, hint: Any, options: tuple[Any, ...], call
     shapes = [x for x in near if str(x.found).startswith("shape")]
     if near and len(near) == len(shapes):
         raise BadArgument(near[0].argument, near[0].found, " or ".join(x.allowed for x in near))
-    raise (
-        next(x for x in near if x not in shapes)
-        if near
-        else BadArgument(name, show(value), describe(hint))
-    )
+    if near:
+        raise next(x for x in near if x not in shapes)
+    raise BadArgument(name, show(value), describe(hint))
 
 
 def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
@@ -361,11 +358,9 @@ def _read_container(
     if not isinstance(value, collections.abc.Sized):
         return parts
     read = list(parts)
-    return (
-        (read if isinstance(value, list) else tuple(read))
-        if isinstance(value, collections.abc.Sequence)
-        else value
-    )
+    if not isinstance(value, collections.abc.Sequence):
+        return value
+    return read if isinstance(value, list) else tuple(read)
 
 
 def _has_tensor(hint: Any) -> bool:
@@ -463,8 +458,7 @@ def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor
     A None in `shape` allows any size of this axis. Errors call the tensor by `name`.
     """
     call = _Call(gradients=True)
-    _read_tensor(
-        name, value, Float[Tensor, " ".join("_" if s is None else str(s) for s in shape)], call
-    )
+    axes = " ".join("_" if size is None else str(size) for size in shape)
+    _read_tensor(name, value, Float[Tensor, axes], call)
     call.check_numbers()
     return value

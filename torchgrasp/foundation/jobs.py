@@ -133,9 +133,8 @@ def _run_pool(
     except ImportError as error:
         raise MissingExtra("pebble", "sim") from error
     # The initializer imports the module of the function before the time of the first task begins.
-    own = b"__main__" in bytes(
-        reduction.ForkingPickler.dumps(function)
-    )  # only the script has the function
+    # whether only the script has the function
+    own = b"__main__" in bytes(reduction.ForkingPickler.dumps(function))
     if _USUAL.get_start_method() == "forkserver":
         _USUAL.set_forkserver_preload(["torchgrasp"])
     pool = ProcessPool(
@@ -171,9 +170,8 @@ def _run_pool(
             if late or isinstance(error, TimeoutError):
                 yield number, Status.TIMED_OUT
             elif isinstance(error, ProcessExpired) and number not in died:
-                died.add(
-                    number
-                )  # a machine short of memory may kill any process: try once more, first
+                # a machine short of memory may kill any process: try once more, first
+                died.add(number)
                 waiting.appendleft((number, task))
             elif isinstance(error, ProcessExpired):
                 yield number, Status.WORKER_DIED
@@ -184,9 +182,8 @@ def _run_pool(
             (number, task) for number, (task, _) in sorted(running.items(), reverse=True)
         )
         pool.stop()
-        with contextlib.suppress(
-            TimeoutError
-        ):  # a signal can leave pebble's threads waiting for each other
+        # a signal can leave pebble's threads waiting for each other
+        with contextlib.suppress(TimeoutError):
             pool.join(10.0)
 
 

@@ -17,11 +17,9 @@ class _Late(types.ModuleType):
         if name.startswith("__"):
             raise AttributeError(name)
         module = importlib.import_module(self.__name__)
-        return (
-            getattr(module, name)
-            if hasattr(module, name)
-            else importlib.import_module(f"{self.__name__}.{name}")
-        )
+        if hasattr(module, name):
+            return getattr(module, name)
+        return importlib.import_module(f"{self.__name__}.{name}")
 
 
 class _Package(types.ModuleType):

@@ -72,9 +72,8 @@ error.
 # least positive and largest finite number
 LEAST = sys.float_info.min
 MOST = sys.float_info.max
-Seed = Annotated[
-    int, Range(0, 2**63 - 1, "a whole number from 0 to 2**63 - 1")
-]  # a seed of random draws
+# a seed of random draws
+Seed = Annotated[int, Range(0, 2**63 - 1, "a whole number from 0 to 2**63 - 1")]
 Count = Annotated[int, Range(1, 1_000_000)]  # a number of objects that are kept in memory
 Positive = Annotated[float, Range(LEAST, MOST, "a positive number")]  # a number above zero
 Fraction = Annotated[float, Range(0.0, 1.0)]  # a share or a probability

@@ -1,9 +1,9 @@
 """Settings of torch that belong to the caller: public calls leave them while they compute.
 
-Inside `torch.autocast`, or with products of matrices in TensorFloat-32 or bfloat16, fingertips are
-tenths of a millimetre off, and the same seed gives another plan. What is made in inference mode can
-not be differentiated later. A default device would move tensors that the library makes, such as
-random draws.
+Inside `torch.autocast`, fingertips are tenths of a millimetre off, and the same seed gives another
+plan. The same holds for products of matrices in TensorFloat-32 or bfloat16. What is made in
+inference mode can not be differentiated later. A default device would move tensors that the library
+makes, such as random draws.
 """
 
 import contextlib

@@ -5,6 +5,7 @@ import functools
 import inspect
 import threading
 from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager
 from typing import Any, TypeVar
 
 import torch
@@ -50,16 +51,20 @@ def single_threaded(function: Function) -> Function:
     def call(*args: Any, **kwargs: Any) -> Any:
         with one_thread():
             result = function(*args, **kwargs)
-        return _each(result) if inspect.isgenerator(result) else result
+        return each_within(result, one_thread) if inspect.isgenerator(result) else result
 
     return call  # pyright: ignore[reportReturnType]
 
 
-def _each(items: Generator[Any, Any, Any]) -> Iterator[Any]:
-    """Yield the items of a generator; each item is computed with torch set to one thread."""
+def each_within(
+    items: Generator[Any, Any, Any], context: Callable[[], AbstractContextManager[None]]
+) -> Iterator[Any]:
+    """Yield the items of a generator; each is computed within a new context, which ends before the
+    item is yielded.
+    """
     with contextlib.closing(items):
         while True:
-            with one_thread():
+            with context():
                 try:
                     item = next(items)
                 except StopIteration:

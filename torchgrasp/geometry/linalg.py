@@ -69,6 +69,11 @@ def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
     return unit(v / power)
 
 
+def perpendicular(v: Float[Tensor, "*b 3"], axis: Float[Tensor, "*c 3"]) -> Float[Tensor, "*d 3"]:
+    """Return the parts of vectors `v` that are perpendicular to unit vectors `axis`."""
+    return v - dot(v, axis, keepdim=True) * axis
+
+
 def across(normal: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
     """Return (first, second): two unit vectors perpendicular to each unit normal.
 

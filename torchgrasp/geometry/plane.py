@@ -173,6 +173,15 @@ def as_plane(table: Plane | float | None) -> Plane | None:
     return Plane.horizontal(table)
 
 
+def faces_of(table: Plane | None) -> tuple[Plane, ...]:
+    """Return the planes at which a table ends: its top and, with an edge, its side; none without a
+    table.
+    """
+    if table is None:
+        return ()
+    return (table,) if table.edge is None else (table, table.edge)
+
+
 def upright_frame(
     points: Float[Tensor, "n 3"],
     viewpoint: Float[Tensor, "*v 3"] | None = None,
@@ -191,24 +200,11 @@ def upright_frame(
     points = points.detach().cpu().double()
     centre = points.mean(0)
     offset = points - centre
-    eye = None
-    if viewpoint is not None:
-        eye = viewpoint.detach().cpu().double().reshape(-1, 3).mean(0) - centre
+    eyes = None if viewpoint is None else viewpoint.detach().cpu().double()
+    eye = None if eyes is None else eyes.reshape(-1, 3).mean(0) - centre
+    # z is up
     if table is not None:
-        heights = table.height(points)
-        middle = float(heights.median())
-        if middle < -MOST_ABOVE:
-            found = f"a plane {-middle:.3g} m above the middle of the cloud"
-            raise BadArgument("table", found, "one under the object")
-        top = float(heights.max())
-        if top > MAX_EXTENT:  # the object would be as high
-            found = f"a plane {top:.3g} m below the object's top"
-            raise BadArgument("table", found, f"one at most {MAX_EXTENT:g} m below it, in metres")
-        if viewpoint is not None:
-            above = float(table.height(viewpoint.detach().cpu().double()).min())
-            if above <= 0:
-                found = f"the camera {-above:.3g} m below it"
-                raise BadArgument("table", found, "a table below the camera")
+        _check_under(table, points, eyes)
         z = unit(table.normal.detach().cpu().double())
         centre = centre - table.height(centre) * z
     elif eye is not None and bool(eye.any()):
@@ -217,15 +213,38 @@ def upright_frame(
     else:
         z = torch.linalg.svd(offset, full_matrices=False).Vh[2]
         z = z if float((offset @ z).pow(3).sum()) >= 0 else -z
+    # x points towards the camera, or to where the points reach farthest
+    ahead = None
     if eye is not None:
         level = eye - (eye @ z) * z
-        steep = LEAST_TILT * norm(eye)
-        eye = level if norm(level) > steep else None
-    if eye is None:
+        ahead = level if norm(level) > LEAST_TILT * norm(eye) else None
+    if ahead is None:
         level = offset - (offset @ z)[:, None] * z
-        eye = level[norm(level).argmax()]
-    x = unit(eye - (eye @ z) * z)
+        ahead = level[norm(level).argmax()]
+    x = unit(ahead - (ahead @ z) * z)
     return rigid(torch.stack([x, torch.linalg.cross(z, x), z], -1), centre)
+
+
+def _check_under(
+    table: Plane, points: Float[Tensor, "n 3"], eyes: Float[Tensor, "*v 3"] | None
+) -> None:
+    """Raise `BadArgument` for a table above most points, above a camera, or far below all points."""
+    heights = table.height(points)
+    middle = float(heights.median())
+    if middle < -MOST_ABOVE:
+        found = f"a plane {-middle:.3g} m above the middle of the cloud"
+        raise BadArgument("table", found, "one under the object")
+    top = float(heights.max())
+    if top > MAX_EXTENT:  # the object would be as high
+        found = f"a plane {top:.3g} m below the object's top"
+        raise BadArgument("table", found, f"one at most {MAX_EXTENT:g} m below it, in metres")
+    if eyes is None:
+        return
+    above = float(table.height(eyes).min())
+    if above <= 0:
+        raise BadArgument(
+            "table", f"the camera {-above:.3g} m below it", "a table below the camera"
+        )
 
 
 def upright_table(

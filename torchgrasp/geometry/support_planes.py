@@ -319,10 +319,9 @@ def find_supports(
     Objects stand on a support, over its region, and the camera sees nothing through the region. The
     support with the most points low above it comes first. The points count twice if the camera
     looks at the support, and half if it is bowed. They count a quarter if the camera would have to
-    be upside down to see the support from above, or if they are on a wall beside it. Walls
-    beside the first support, on which far fewer points stand, are left out. Of parallel supports, a
-    higher one as wide as furniture comes first. A
-    rigid motion of all arguments moves the supports alike.
+    be upside down to see it from above. So do points on a wall beside it. Walls beside the first
+    support, on which far fewer points stand, are left out. Of parallel supports, a higher one as
+    wide as furniture comes first. A rigid motion of all arguments moves the supports alike.
 
     Raises `NoSupport` if there is none.
     """
@@ -681,8 +680,10 @@ def _leans(view: SeenPoints, surface: _FlatSurface) -> float:
 
 
 def _is_wall(view: SeenPoints, surface: _FlatSurface, surfaces: list[_FlatSurface]) -> bool:
-    """Return whether a surface would be level for a camera upside down alone, and a larger one at an
-    angle to it is level for an upright camera.
+    """Return whether a surface is level for a camera upside down alone, beside a larger one that is
+    level for an upright camera.
+
+    The larger one is at an angle to it, and as wide as furniture.
     """
     if _leans(view, surface) > -SUPPORTS.downward:
         return False

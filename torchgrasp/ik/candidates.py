@@ -31,9 +31,8 @@ Reachable = Callable[[Tensor], Tensor]
 """A user's function of hand poses (k, 4, 4) [m] in the object's frame, which returns a mask (k,) of
 those that an arm reaches.
 """
-PAPER_TOLERANCE = (
-    10 * MILLIMETRE
-)  # the paper's largest distance [m] of a tip from its contact: about a tip's radius
+# the paper's largest distance [m] of a tip from its contact: about a tip's radius
+PAPER_TOLERANCE = 10 * MILLIMETRE
 TIP_TOLERANCE = 1 * MILLIMETRE
 TIP_PENETRATION = 2 * MILLIMETRE
 """Largest distance [m] of a tip from its contact, and largest depth [m] of a tip below the
@@ -123,11 +122,9 @@ class GraspProblem(Value):
         All are returned if `reachable` is None. Raises `BadArgument` if `reachable` does not return
         a mask of booleans, one for each pose.
         """
-        return (
-            seeds
-            if self.reachable is None
-            else seeds[ask_reachable(self.reachable, seeds.obj_from_hand)]
-        )
+        if self.reachable is None:
+            return seeds
+        return seeds[ask_reachable(self.reachable, seeds.obj_from_hand)]
 
 
 def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
@@ -163,11 +160,9 @@ class GraspCandidates(Batch):
     """
 
     configuration: Annotated[Configuration, Rows("g")]
-    contacts: Annotated[Contacts, Rows("g")]  # in the order of the fingers
+    contacts: Annotated[Contacts, Rows("g")]
     certificate: Annotated[Certificate, Rows("g")]
-    permutation: Int[
-        Tensor, "g f"
-    ]  # finger i touches contact `permutation[:, i]` of the planned set
+    permutation: Int[Tensor, "g f"]
     status: Int[Tensor, "g"]
 
 
@@ -270,6 +265,7 @@ def check_candidates(
     planned = torch.where(unproven, int(Status.NOT_CLOSED), candidates.status)
     errors = measure_errors(hand, configuration, contacts, world, rolling, tolerance)
 
+    # the hand is opened only where the grasp itself is good
     pregrasp = configuration.joints.clone()
     touching = flatnonzero((planned == Status.OK) & (errors.status == Status.OK))
     pregrasp[touching] = open_hand(
@@ -282,12 +278,14 @@ def check_candidates(
     blocked = (errors.status == Status.OK) & ~is_clear(hand, opened, world)
     status = torch.where(blocked, int(Status.PREGRASP), errors.status)
 
+    # a straight way leads to the opened hand
     approach = rotate(configuration.obj_from_hand, hand.approach.to(problem.center)[None])[:, 0]
     ready = flatnonzero(status == Status.OK)
     approach[ready], clearance = find_approach(hand, opened[ready], world.rows(ready))
     status[ready] = torch.where(clearance >= 0, int(Status.OK), int(Status.NO_APPROACH))
     if world.obstacles is not None:
         _keep_clear(problem, configuration, opened, approach, status)
+    # an arm is asked for the poses that are left
     if problem.reachable is not None:
         ready = flatnonzero((status == Status.OK) & (planned == Status.OK))
         refused = ~ask_reachable(problem.reachable, configuration.obj_from_hand[ready])

@@ -197,8 +197,7 @@ def level(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b"]:
     height = points @ table.normal.to(points)
     if table.edge is None:
         return height
-    beyond = points @ table.edge.normal.to(points) - table.edge.offset
-    return torch.maximum(height, table.offset + beyond)
+    return torch.maximum(height, table.offset + table.edge.height(points))
 
 
 def away(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b 3"]:
@@ -210,9 +209,8 @@ def away(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b 3"]:
     normal = table.normal.to(points).expand_as(points)
     if table.edge is None:
         return normal
-    height = points @ table.normal.to(points) - table.offset
-    beyond = points @ table.edge.normal.to(points) - table.edge.offset
-    return torch.where((beyond > height)[..., None], table.edge.normal.to(points), normal)
+    nearer = table.edge.height(points) > table.height(points)
+    return torch.where(nearer[..., None], table.edge.normal.to(points), normal)
 
 
 def table_clearance(
@@ -259,6 +257,7 @@ def clearance_rows(
     """
     pairs = spatial.hand.self_collision
     moves = spatial.hand.motion.moves
+    # the pairs of links that are nearest to each other
     separation, number, wrench = pairs.pushes(spatial.obj_from_link, SELF_CLEARANCE)
     count = min(HINGES, len(pairs.pairs))
     separation, index = separation.T.topk(count, dim=1, largest=False, sorted=False)
@@ -279,6 +278,7 @@ def sphere_rows(
     motion = spatial.hand.motion
     centres = spatial.sphere_centres
     radius = spheres.radius.to(centres)
+    # approximate clearances of all spheres from each part of the world tell which ones count
     found = []
     for field in world.fields:
         coarse = field.nearest_node(centres) - radius
@@ -293,7 +293,8 @@ def sphere_rows(
         return []
     count = min(HINGES, len(radius))
     coarse, index = torch.stack(found, 1).topk(count, dim=2, largest=False, sorted=False)
-    points = centres[row_numbers(centres)[:, None, None], index]
+    points = centres[row_numbers(centres)[:, None, None], index]  # (g, parts, k, 3)
+    # exact clearances of these, and the directions in which they grow
     clearance = []
     direction = []
     for k, field in enumerate(world.fields):

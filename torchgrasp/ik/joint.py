@@ -152,6 +152,7 @@ class JointProblem:
         """
         hand = self.hand
         shape = self.shape
+        # the variance is that at the start of the stage, extrapolated
         mean = triple_mean_jet(shape, state.points)
         slope = state.variance_gradient
         jet = SurfaceJet(**vars(mean), variance=state.variance, variance_gradient=slope)
@@ -166,6 +167,7 @@ class JointProblem:
         )
         contact, contact_by_x = self._contact_residuals(state, jet, flat)
 
+        # hand and contacts meet only in the tips
         rows = by_hand.shape[1]
         h = by_hand.shape[2]
         points = tips_by_points.shape[2]
@@ -239,6 +241,7 @@ class JointProblem:
                 largest=HAND_STEP,
             )
             state, cost = levenberg_marquardt(sliding, state, stage.steps)
+            # what is hopeless leaves the batch
             kept = flatnonzero(cost < stage.hopeless)
             configuration = state.configuration[kept]
             points = state.points[kept]

@@ -64,7 +64,7 @@ def find_approach(
     the object's frame.
     """
     spheres = hand.collision_spheres
-    centres = SpatialJacobian.at(hand, opened).sphere_centres
+    centres = _centres(hand, opened)
     radius = spheres.radius.to(centres)
     candidates = approach_directions(hand, opened, world.plane)
     tried = [_clearance(centres, radius, d, world, exact=False) for d in candidates.unbind(1)]

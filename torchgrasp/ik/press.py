@@ -11,11 +11,19 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value, flatnonzero
+from torchgrasp.foundation.base import Batch, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Seed
 from torchgrasp.geometry.frames import inverse, rigid
-from torchgrasp.geometry.linalg import across, eye_like, fibonacci_sphere, norm, unit
+from torchgrasp.geometry.linalg import (
+    across,
+    eye_like,
+    fibonacci_sphere,
+    matvec,
+    norm,
+    perpendicular,
+    unit,
+)
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.sample import sample_configurations
 
@@ -53,7 +61,7 @@ PRESS = PressNumbers()
 
 @checked
 @dataclasses.dataclass(frozen=True)
-class PressPostures(Value):
+class PressPostures(Batch):
     """Pressing postures of a hand: first those of two tips, each kind by falling gap.
 
     The gap is the distance by which all other links are higher than the pressing tips.
@@ -82,8 +90,10 @@ class PressPostures(Value):
     stiffness: Float[Tensor, "p f 3 3"]
     spheres: Float[Tensor, "p s 3"]
 
-    def __len__(self) -> int:
-        return len(self.joints)
+    @property
+    def apart(self) -> Float[Tensor, "p"]:
+        """Distance [m] of the two pressing tips' lowest points; infinite for one tip."""
+        return _apart(self.feet, self.presses[:, None])[:, 0]
 
 
 @checked
@@ -126,9 +136,7 @@ def _search(hand: Hand, seed: int) -> PressPostures:
     facing = directions @ pads.mT > PRESS.cosine
     presses = facing & (reach > reach.amax(2, keepdim=True) - PRESS.level)
     presses &= presses.sum(2, keepdim=True) <= 2
-    lowest = torch.where(presses, reach, math.inf).amin(2)
-    others = torch.where(presses, -math.inf, reach).amax(2)
-    gap = lowest - torch.maximum(links, others)
+    gap = _gap(reach, links, presses)
     apart = _apart(centres, presses)
     good = presses.any(2) & (gap > PRESS.gap) & (apart > PRESS.apart)
     # two tips resist a turn, so they come before one; then the wider gap
@@ -140,7 +148,7 @@ def _search(hand: Hand, seed: int) -> PressPostures:
     joints = joints[row]
     presses = presses[row, at]
     down = _levelled(centres[row], radius, directions[at], presses)
-    row = flatnonzero(_gap(hand, joints, down, presses) > PRESS.gap)
+    row = flatnonzero(_gap_along(hand, joints, down, presses) > PRESS.gap)
     return _built(hand, joints[row], down[row], presses[row])
 
 
@@ -159,27 +167,35 @@ def _levelled(
     side = side / length
     # the component along the side by which the smaller tip reaches as far as the larger one
     share = (radius[index[:, 1]] - radius[index[:, 0]])[:, None] / length
-    rest = unit(down - (down * side).sum(1, keepdim=True) * side)
+    rest = unit(perpendicular(down, side))
     levelled = share * side + torch.sqrt(1 - share**2) * rest
     return torch.where(two[:, None], levelled, down)
 
 
-def _gap(
+def _gap_along(
     hand: Hand,
     joints: Float[Tensor, "p h"],
     down: Float[Tensor, "p 3"],
     presses: Bool[Tensor, "p f"],
 ) -> Float[Tensor, "p"]:
-    """Return by how much [m] all other links are higher than the pressing tips."""
+    """Return the `_gap` [m] of each posture in its direction of pressing."""
     around = hand.collision_spheres
-    radius = hand.tips.radius.to(down)
-    reach = (hand.tip_centres(joints) @ down[..., None])[..., 0] + radius
-    spheres = hand.sphere_centres(joints)
+    reach = matvec(hand.tip_centres(joints), down) + hand.tips.radius.to(down)
+    links = matvec(hand.sphere_centres(joints), down) + around.radius
+    # links that end in a pressing tip touch with it
     own = around.touching & presses[:, around.finger.clamp_min(0)]
-    links = (spheres @ down[..., None])[..., 0] + around.radius
-    links = torch.where(own, -math.inf, links).amax(1)
-    lowest = torch.where(presses, reach, math.inf).amin(1)
-    others = torch.where(presses, -math.inf, reach).amax(1)
+    return _gap(reach, torch.where(own, -math.inf, links).amax(1), presses)
+
+
+def _gap(
+    reach: Float[Tensor, "*b f"], links: Float[Tensor, "*b"], presses: Bool[Tensor, "*b f"]
+) -> Float[Tensor, "*b"]:
+    """Return by how much [m] all else of a hand is higher than its pressing tips.
+
+    `reach` and `links` [m] are how far each tip and the other links reach down.
+    """
+    lowest = torch.where(presses, reach, math.inf).amin(-1)
+    others = torch.where(presses, -math.inf, reach).amax(-1)
     return lowest - torch.maximum(links, others)
 
 

@@ -73,9 +73,8 @@ def tip_rows(
     g = len(target)
     centres = spatial.tips.permute(2, 1, 0)
     pads = spatial.pads.permute(2, 1, 0)
-    outside = tips.cone.cos().to(pads) + dot(
-        pads, normals
-    )  # the contact direction is the inward normal
+    # the contact direction is the inward normal
+    outside = tips.cone.cos().to(pads) + dot(pads, normals)
     weight = PAD_WEIGHT * (outside > 0).to(pads)
     axes = eye_like(3, pads).expand(g, len(tips), 3, 3) * (TIP_WEIGHT / MILLIMETRE)
     pulls = torch.cat(

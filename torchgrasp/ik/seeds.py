@@ -21,6 +21,7 @@ from torchgrasp.foundation.base import (
     flatnonzero,
     join,
     lexical_order,
+    row_numbers,
     settle,
 )
 from torchgrasp.foundation.checks import checked
@@ -255,37 +256,27 @@ def nearest_postures(
     framed = ~degenerate(triangle_of(centres))
     parts = []
     for row in flatnonzero(framed.any(1)).split(at_once(centres, SEEDS.rows)):
+        # of all assignments of contacts to fingers, a few are compared with the whole library
         obj_from_vf, wanted = _describe(centres[row], inward[row], framed[row])
         assignment = _likely_assignments(wanted, given, framed[row])
-        at = torch.arange(len(row), device=device)[:, None]
+        at = row_numbers(row)[:, None]
         obj_from_vf = obj_from_vf[at, assignment]
         wanted = wanted[at, assignment]
         energy = _energies(wanted, given, framed[row[:, None], assignment])
+        # the c nearest pairs of assignment and posture (r, c)
         energy, index = energy.flatten(1).topk(candidates, 1, largest=False)
         order = index // len(given)
         sample = index % len(given)
+        # they are placed by Eq. (24), and ranked by clearance, too
         obj_from_hand = obj_from_vf[at, order] @ library.vf_from_hand[sample]
         placed = obj_from_hand.flatten(0, 1).float()
         spheres = library.spheres.mT[sample.flatten()]
         spheres = torch.baddbmm(placed[:, :3, 3:], placed[:, :3, :3], spheres)
         spheres = spheres.mT.unflatten(0, sample.shape)  # (r, c, k, 3)
-        # Squared millimetres, weighed as in `refine`.
+        # squared millimetres, weighed as in `refine`
         tips = 2 * energy * (TIP_WEIGHT * SEEDS.length_scale / MILLIMETRE) ** 2
         cost = tips + collision_cost(spheres, library.hand.collision_spheres, world.rows(row))
-        if reachable is None:
-            best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
-            b = at.repeat_interleave(n_seeds)  # one row for each seed
-        else:
-            best = cost.topk(min(SEEDS.spare * n_seeds, candidates), 1, largest=False).indices
-            reached = torch.zeros_like(best, dtype=torch.bool)
-            for some in (slice(n_seeds), slice(n_seeds, None)):
-                short = flatnonzero(reached.sum(1) < n_seeds)
-                poses = obj_from_hand[short[:, None], best[short, some]]
-                answers = ask_reachable(reachable, poses.flatten(0, 1))
-                reached[short, some] = answers.reshape(poses.shape[:2])
-            kept = reached & (reached.cumsum(1) <= n_seeds)
-            b = at.expand_as(best)[kept]
-            best = best[kept]
+        b, best = _choose(cost, obj_from_hand, n_seeds, reachable)
         order = order[b, best]
         sample = sample[b, best]
         chosen = assignment[b, order]
@@ -296,6 +287,35 @@ def nearest_postures(
         pose = obj_from_hand[b, best]
         parts.append(IKSeeds(joints, pose, row[b], permutations[chosen], energy, tip_error))
     return join(parts).to(contacts.points.dtype)
+
+
+def _choose(
+    cost: Float[Tensor, "r c"],
+    obj_from_hand: Float[Tensor, "r c 4 4"],
+    n_seeds: int,
+    reachable: Reachable | None,
+) -> tuple[Int[Tensor, "k"], Int[Tensor, "k"]]:
+    """Return the contact set of each chosen candidate, then its index among the c candidates of the
+    set.
+
+    At most `n_seeds` of each set are chosen, those of the lowest `cost`. The next takes the place
+    of a hand pose that is not `reachable`.
+    """
+    at = row_numbers(cost)[:, None]
+    if reachable is None:
+        best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
+        return at[:, 0].repeat_interleave(n_seeds), best
+    count = min(SEEDS.spare * n_seeds, cost.shape[1])
+    best = cost.topk(count, 1, largest=False).indices
+    reached = torch.zeros_like(best, dtype=torch.bool)
+    # the spare ones are asked for only where some of the first are refused
+    for some in (slice(n_seeds), slice(n_seeds, None)):
+        short = flatnonzero(reached.sum(1) < n_seeds)
+        poses = obj_from_hand[short[:, None], best[short, some]]
+        answers = ask_reachable(reachable, poses.flatten(0, 1))
+        reached[short, some] = answers.reshape(poses.shape[:2])
+    kept = reached & (reached.cumsum(1) <= n_seeds)
+    return at.expand_as(best)[kept], best[kept]
 
 
 def _describe(

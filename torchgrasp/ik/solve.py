@@ -19,9 +19,10 @@ from torchgrasp.foundation.rules import ANY
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.attempts import Attempts, assign, refine_by_cobyla
+from torchgrasp.ik.attempts import Attempts, assign
 from torchgrasp.ik.candidates import measure_errors
 from torchgrasp.ik.clearance import CollisionWorld
+from torchgrasp.ik.cobyla import refine_by_cobyla
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.refine import refine
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures, query_mixture
@@ -182,11 +183,9 @@ def _refine_seeds(
     """Return the measured configurations of seeds that were refined onto their contacts by the
     given `method`.
     """
-    refined = refine_exactly
-    rolling = True
-    if method == "cobyla":
-        refined = refine_by_cobyla
-        rolling = False
+    # the paper's method touches with fixed points of the pads
+    rolling = method != "cobyla"
+    refined = refine_exactly if rolling else refine_by_cobyla
     parts = []
     size = SOLVING.part
     for first in range(0, max(len(seeds), 1), size):

@@ -146,44 +146,38 @@ def find_drag(
     Args:
         object_: the object on its table.
         hand: the hand.
-        table: the table, with an edge, in the frame of the cloud.
+        table: the table, with an edge, in the frame of the cloud; in float64 on the CPU.
         mass: mass [kg] of the object.
         friction: coefficient of friction between fingertips and object.
         table_friction: coefficient of friction between object and table.
     """
-    assert table.edge is not None
     balance = EdgeBalance.of(object_, table)
-    length = balance.length
-    if length <= DRAG.shortest:
+    if balance.length <= DRAG.shortest:
         return "the object hangs over the edge as far as it can"
     force = pressing_force(mass, friction, table_friction)
     if force is None:
         return f"an object of {mass:g} kg is too heavy to drag"
-    if object_.scene is not None and length > OCCUPANCY.sideways:
+    if object_.scene is not None and balance.length > OCCUPANCY.sideways:
         return f"the camera's scene is known only {OCCUPANCY.sideways:g} m around the object"
-    # the torque of the weight's friction, over the friction that is left to two tips
-    lever = 2 * table_friction * mass * TASKS.gravity / (DRAG.share * friction * force)
-    postures = press_postures(hand)
-    hand = hand.to("cpu", torch.float64)
+    # displacements in the frame of the cloud, beside those in the upright frame
     frame = object_.obj_from_upright
-    outward = table.edge.normal.cpu().double()
     turned = inverse(frame)[:3, :3]
-    ways = list[Float[Tensor, "3"]]()
-    for angle in DRAG.aside:
-        turn = rotation_from_vector(math.radians(angle) * table.normal.cpu().double())
-        ways.append((length / math.cos(math.radians(angle))) * (turn @ outward))
-    ways = [way for way in ways if _is_free(object_, turned @ way)]
+    ways = [(way, turned @ way) for way in _ways(table, balance.length)]
+    ways = [(way, upright) for way, upright in ways if _is_free(object_, upright)]
     if not ways:
         return "a neighbour is in the object's way to the edge"
     no_posture = "no posture of the hand presses on the object from above, clear of all else"
     corners = _facing_up(object_)
     if not len(corners):
         return no_posture
-    top = _Top(corners)
-    searches = [_PressSearch(object_, hand, postures, balance, top, turned @ way) for way in ways]
+    # the torque of the weight's friction, over the friction that is left to two tips
+    lever = 2 * table_friction * mass * TASKS.gravity / (DRAG.share * friction * force)
+    postures = press_postures(hand)
+    hand = hand.to("cpu", torch.float64)
+    search = _PressSearch(object_, hand, postures, balance, _Top(corners), force, lever)
     # two tips resist a turn of the object; a narrow one would roll unless it is dragged along
-    for tips, (search, displacement) in itertools.product((2, 1), zip(searches, ways, strict=True)):
-        found = search.place(tips, force, lever)
+    for tips, (displacement, way) in itertools.product((2, 1), ways):
+        found = search.place(tips, way)
         if found is None:
             continue
         at, upright_from_press = found
@@ -200,6 +194,18 @@ def find_drag(
             table=table,
         )
     return no_posture
+
+
+def _ways(table: Plane, length: float) -> list[Float[Tensor, "3"]]:
+    """Return the displacements [m] that bring an object nearer to a table's edge by a `length` [m]:
+    the shortest, then aslant.
+    """
+    assert table.edge is not None
+    ways = list[Float[Tensor, "3"]]()
+    for angle in map(math.radians, DRAG.aside):
+        turn = rotation_from_vector(angle * table.normal)
+        ways.append((length / math.cos(angle)) * (turn @ table.edge.normal))
+    return ways
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,10 +229,10 @@ class EdgeBalance:
         """Return the balance of an object on a table with an edge, in the frame of the cloud."""
         assert table.edge is not None
         centre = centre_of_mass(object_)
-        edge = inverse(object_.obj_from_upright)[:3, :3] @ table.edge.normal.cpu().double()
+        edge = inverse(object_.obj_from_upright)[:3, :3] @ table.edge.normal
         in_cloud = apply(object_.obj_from_upright, centre[None])[0]
         away = -float(table.edge.height(in_cloud))
-        reach = float(((object_.surface.vertices.cpu().double() - centre) @ edge).max())
+        reach = float(((_vertices(object_) - centre) @ edge).max())
         return cls(centre, edge, away, max(DRAG.behind, DRAG.unsure * reach))
 
     @property
@@ -255,7 +261,7 @@ def centre_of_mass(object_: ShapedObject) -> Float[Tensor, "3"]:
     Each triangle and the mean vertex span a tetrahedron. The centroid is the mean of theirs, with
     their signed volumes as weights.
     """
-    vertices = object_.surface.vertices.cpu().double()
+    vertices = _vertices(object_)
     middle = vertices.mean(0)
     corners = (vertices - middle)[object_.surface.faces.cpu()]  # (f, 3, 3)
     volumes = torch.linalg.det(corners)
@@ -266,7 +272,15 @@ def centre_of_mass(object_: ShapedObject) -> Float[Tensor, "3"]:
 class _PressSearch:
     """The search for a pressing posture and its place on an object.
 
-    `way` [m] is the displacement of hand and object, in the upright frame.
+    Attributes:
+        object_: the object.
+        hand: the hand, in float64 on the CPU.
+        postures: its pressing postures.
+        balance: where the weight of the object acts.
+        top: the map of the object's top.
+        force: sum of the normal forces [N] of the pressing tips.
+        lever: least ratio of the distance of two tips to that of the centre of mass from the line
+            of their drag.
     """
 
     object_: ShapedObject
@@ -274,60 +288,58 @@ class _PressSearch:
     postures: PressPostures
     balance: EdgeBalance
     top: "_Top"
-    way: Float[Tensor, "3"]
+    force: float
+    lever: float
 
-    def place(
-        self, tips: int, force: float, lever: float
-    ) -> tuple[int, Float[Tensor, "4 4"]] | None:
+    def place(self, tips: int, way: Float[Tensor, "3"]) -> tuple[int, Float[Tensor, "4 4"]] | None:
         """Return the index of the best posture that presses with one or two `tips`, and its pose (4,
-        4) [m] on the object.
+        4) [m] on the object; None if no posture fits.
 
-        None if no posture fits. `force` [N] is the sum of the tips' normal forces. Two tips must be
-        at least `lever` times as far apart as the centre of mass is off the line of their drag.
+        `way` [m] is the displacement of hand and object, in the upright frame.
         """
-        postures = self.postures
-        outward = unit(self.way)
+        outward = unit(way)
         sideways = torch.stack([-outward[1], outward[0], torch.zeros_like(outward[0])])
-        stands = self.top.stands(outward)
+        count = self.postures.presses.sum(1)
+        able = (count == tips) & (self.postures.strength >= self.force / tips)
+        rows = flatnonzero(able)[: DRAG.postures]
+        postures = self.postures[rows]
+        turns = _turns(DRAG.turns)  # (t, 3, 3)
+        steady = _is_steady(postures, turns.mT @ outward)  # (p, t)
+        turned = (turns @ postures.feet[:, None].mT).mT  # (p, t, f, 3)
+        presses = postures.presses[:, None]  # (p, 1, f)
+        # places that are still over the table at the end of the drag
         centre = self.balance.centre
         edge = self.balance.edge
         most = self.balance.behind - DRAG.supported
+        stands = self.top.stands(outward)
         places = self.top.places(stands, centre)
         places = places[(places - centre) @ edge <= most][: DRAG.places]
-        share = postures.presses.sum(1).double()
-        able = flatnonzero(postures.strength >= force / share)
-        angles = torch.arange(DRAG.turns, device="cpu").double() * (2 * math.pi / DRAG.turns)
-        turns = _turns(angles)  # (t, 3, 3)
-        steady = _is_steady(postures, turns.mT @ outward)  # (p, t)
-        rows = able[postures.presses[able].sum(1) == tips][: DRAG.postures]
-        presses = postures.presses[rows][:, None]
-        apart = _apart(postures.feet[rows], postures.presses[rows])
-        turned = (turns @ postures.feet[rows][:, None].mT).mT  # (p, t, f, 3)
         for place in places:
+            # two tips far apart resist a turn, or one on a line with the centre of mass
             off = abs(float((centre - place) @ sideways))
-            straight = lever * off <= apart
-            if tips == 1:
-                straight = torch.full_like(straight, off <= DRAG.pivot)
+            if tips == 1 and off > DRAG.pivot:
+                continue
+            straight = self.lever * off <= postures.apart
+            # each pressing tip ends over the table, and stands on a flat top at the same height
             feet = turned + place
             ahead = ((feet - centre) @ edge).where(presses, -math.inf).amax(2)
             height, flat = self.top.look(stands, feet[..., :2])
             low = height.where(presses, math.inf).amin(2)
             high = height.where(presses, -math.inf).amax(2)
-            good = straight[:, None] & steady[rows] & (flat | ~presses).all(2)
-            good &= high - low <= DRAG.flat
-            good &= ahead <= most
+            good = straight[:, None] & steady & (flat | ~presses).all(2)
+            good &= (high - low <= DRAG.flat) & (ahead <= most)
             for p, t in torch.nonzero(good).tolist():
                 at = int(rows[p])
                 pose = rigid(turns[t], torch.stack([place[0], place[1], high[p, t]]))
-                if self.is_clear(at, pose):
+                if self.is_clear(at, pose, way):
                     return at, pose
         return None
 
-    def is_clear(self, at: int, pose: Float[Tensor, "4 4"]) -> bool:
+    def is_clear(self, at: int, pose: Float[Tensor, "4 4"], way: Float[Tensor, "3"]) -> bool:
         """Return whether a hand presses with its pressing tips alone, and keeps clear of all else.
 
         The hand is in the posture with index `at` at a `pose` [m]. It comes down from above, and
-        moves with the object along the way, clear of the table and of the object's neighbours.
+        moves with the object along the `way` [m]. Table and neighbours must not be in its way.
         """
         spheres = self.hand.collision_spheres
         pressing = flatnonzero(self.postures.presses[at])
@@ -348,14 +360,8 @@ class _PressSearch:
             return False
         if self.object_.obstacles is None:
             return True
-        path = torch.cat([down, centres + _shares()[:, None, None] * self.way])
+        path = torch.cat([down, _along(centres, way)])
         return _gap(self.object_.obstacles.field, path, radius) >= DRAG.clear
-
-
-def _apart(feet: Float[Tensor, "p f 3"], presses: Bool[Tensor, "p f"]) -> Float[Tensor, "p"]:
-    """Return the distance [m] of the two pressing tips of each posture; 0 for one tip."""
-    both = presses[:, :, None] & presses[:, None, :]
-    return (torch.cdist(feet, feet) * both).flatten(1).amax(1)
 
 
 def _is_steady(postures: PressPostures, ways: Float[Tensor, "t 3"]) -> Bool[Tensor, "p t"]:
@@ -372,8 +378,14 @@ def _is_steady(postures: PressPostures, ways: Float[Tensor, "t 3"]) -> Bool[Tens
     return (steady | ~postures.presses[:, None]).all(2)
 
 
-def _turns(angles: Float[Tensor, "t"]) -> Float[Tensor, "t 3 3"]:
-    """Return the rotations about the vertical by `angles` [rad]."""
+def _angles(count: int) -> Float[Tensor, "t"]:
+    """Return `count` equal steps around a circle [rad], from 0."""
+    return torch.arange(count, device="cpu").double() * (2 * math.pi / count)
+
+
+def _turns(count: int) -> Float[Tensor, "t 3 3"]:
+    """Return the rotations about the vertical by `count` equal steps."""
+    angles = _angles(count)
     cosine = torch.cos(angles)
     sine = torch.sin(angles)
     zero = torch.zeros_like(angles)
@@ -427,7 +439,7 @@ class _Top:
         """Return whether a tip that drags along the unit vector `outward` can press at each node:
         the top is flat around it.
         """
-        angles = torch.arange(DRAG.ring, device="cpu").double() * (2 * math.pi / DRAG.ring)
+        angles = _angles(DRAG.ring)
         ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)
         # before and behind the tip the top must reach farther
         along = DRAG.support * torch.stack([outward[:2], -outward[:2]])
@@ -452,9 +464,14 @@ class _Top:
         return places[torch.argsort(distance, stable=True)]
 
 
+def _vertices(object_: ShapedObject) -> Float[Tensor, "v 3"]:
+    """Return the vertices [m] of an object's surface, in float64 on the CPU."""
+    return object_.surface.vertices.cpu().double()
+
+
 def _facing_up(object_: ShapedObject) -> Float[Tensor, "k 3 3"]:
     """Return the corners [m] of the triangles of an object's surface that face up."""
-    vertices = object_.surface.vertices.cpu().double()
+    vertices = _vertices(object_)
     corners = vertices[object_.surface.faces.cpu()]  # (f, 3, 3)
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = norm(normals).clamp_min(torch.finfo(normals.dtype).tiny)
@@ -465,8 +482,8 @@ def _is_free(object_: ShapedObject, way: Float[Tensor, "3"]) -> bool:
     """Return whether no neighbour is in the object's way along the table."""
     if object_.obstacles is None:
         return True
-    vertices = object_.surface.vertices.cpu().double()
-    path = vertices + _shares()[:, None, None] * way
+    vertices = _vertices(object_)
+    path = _along(vertices, way)
     field = object_.obstacles.field
     before = field.query(vertices.to(field.nodes))[0].min()
     nearest = field.query(path.flatten(0, 1).to(field.nodes))[0].min()
@@ -474,9 +491,10 @@ def _is_free(object_: ShapedObject, way: Float[Tensor, "3"]) -> bool:
     return bool(nearest >= torch.clamp(before, max=0.0))
 
 
-def _shares() -> Float[Tensor, "k"]:
-    """Return the shares of the way at which collisions are checked."""
-    return torch.linspace(0, 1, DRAG.steps, dtype=torch.float64, device="cpu")
+def _along(points: Float[Tensor, "n 3"], way: Float[Tensor, "3"]) -> Float[Tensor, "k n 3"]:
+    """Return points [m] at the k places along their way at which collisions are checked."""
+    shares = torch.linspace(0, 1, DRAG.steps, dtype=torch.float64, device="cpu")
+    return points + shares[:, None, None] * way
 
 
 def _gap(field: DistanceField, path: Float[Tensor, "*k s 3"], radius: Float[Tensor, "s"]) -> float:

@@ -2,8 +2,8 @@
 over.
 
 A fingertip cannot reach below an object that lies flat. So the hand presses on it from above, and
-drags it until a part hangs over the edge, while its centre of mass stays above the table. The
-fingers then pinch this part from above and below.
+drags it until a part hangs over the edge. Its centre of mass stays above the table. The fingers
+then pinch this part from above and below.
 """
 
 import dataclasses
@@ -22,12 +22,7 @@ from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse, rigid
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.clearance import Obstacles
-from torchgrasp.planner.drag_plan import (
-    DRAG,
-    DragPlan,
-    EdgeBalance,
-    find_drag,
-)
+from torchgrasp.planner.drag_plan import DRAG, DragPlan, EdgeBalance, find_drag
 from torchgrasp.planner.drag_text import with_drag
 from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
@@ -50,9 +45,9 @@ class EdgePlan(Value):
             They are in the frame of the cloud, the best first, as those of `plan_grasps`. Their
             metadata hold the drag (`torchgrasp.planner.drag_of`), so that one file has both.
         shape: the estimated shape after the drag, in the same frame.
-        reason: why there is no drag: the object hangs over the edge far enough, or is too heavy, or
-            no posture of the hand can press on it, or a neighbour is in its way. Or the edge is too
-            far for what the camera saw of a scene. Empty if there is a drag.
+        reason: why there is no drag; empty if there is one. The object hangs over the edge far
+            enough, or is too heavy. Or no posture of the hand can press on it, or a neighbour is
+            in its way. Or the edge is too far for what the camera saw of a scene.
     """
 
     drag: DragPlan | None
@@ -115,18 +110,8 @@ def plan_edge_grasps(
     >>> spec = ContactSpec(table=Plane.horizontal(0.0).ending(0.2 * x, x))
     >>> plan = plan_edge_grasps(load_object("cylinder"), load_hand("barrett"), spec, starts=8)
     """
-    table = spec.plane
-    if table is None or table.edge is None:
-        found = "no table" if table is None else "a table without an edge"
-        raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
-    table = table.to("cpu", torch.float64)
-    edge = table.edge
-    assert edge is not None
-    sure = torch.tensor(DRAG.sure, dtype=torch.float64)
-    friction = float(Distribution.of(spec.friction).quantile(sure))
-    if not friction > table_friction:
-        found = f"{table_friction:g}, and {friction:g} of the fingertips"
-        raise BadArgument("table_friction", found, "less than the friction of the fingertips")
+    table = _table_with_edge(spec)
+    friction = _sure_friction(spec, table_friction)
     hand = as_hand(hand, "hand")
     request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
     object_ = ShapedObject.of(request)
@@ -141,15 +126,37 @@ def plan_edge_grasps(
     drag = find_drag(object_, hand, table, mass, friction, table_friction)
     if isinstance(drag, str):
         return EdgePlan(None, plan_shaped(object_, request), object_.shape.moved(frame), drag)
-    # for the object, the edge comes nearer
+    # in the object's own frame, the drag brings the edge and the neighbours the other way
     shift = rigid(torch.eye(3, dtype=torch.float64), drag.displacement)
-    nearer = dataclasses.replace(table, edge=edge.moved(inverse(shift)))
+    assert table.edge is not None
+    nearer = dataclasses.replace(table, edge=table.edge.moved(inverse(shift)))
     obstacles = _brought(object_, drag.displacement)
-    object_ = dataclasses.replace(object_, table=nearer, obstacles=obstacles)
-    grasps = plan_shaped(object_, request)
-    grasps = move(grasps, shift)
+    dragged = dataclasses.replace(object_, table=nearer, obstacles=obstacles)
+    # back in the frame of the cloud, the table is where it was
+    grasps = move(plan_shaped(dragged, request), shift)
     grasps = dataclasses.replace(grasps, meta={**grasps.meta, "table": table.describe()})
     return EdgePlan(drag, with_drag(grasps, drag), object_.shape.moved(shift @ frame))
+
+
+def _table_with_edge(spec: ContactSpec) -> Plane:
+    """Return the table, in float64 on the CPU; raise `BadArgument` unless it has an edge."""
+    table = spec.plane
+    if table is None or table.edge is None:
+        found = "no table" if table is None else "a table without an edge"
+        raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
+    return table.to("cpu", torch.float64)
+
+
+def _sure_friction(spec: ContactSpec, table_friction: float) -> float:
+    """Return the friction of the fingertips that the drag counts on; raise `BadArgument` unless it
+    is greater than the table's.
+    """
+    sure = torch.tensor(DRAG.sure, dtype=torch.float64)
+    friction = float(Distribution.of(spec.friction).quantile(sure))
+    if not friction > table_friction:
+        found = f"{table_friction:g}, and {friction:g} of the fingertips"
+        raise BadArgument("table_friction", found, "less than the friction of the fingertips")
+    return friction
 
 
 def _weight(mass: float, table: Plane, centre: Float[Tensor, "3"]) -> TaskWrenches:

@@ -22,7 +22,7 @@ from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import Reachable
 from torchgrasp.planner.changes import Change, list_changes, more_starts
 from torchgrasp.planner.objects import Objects, ShapedObject, find_model, pose
-from torchgrasp.planner.planner import plan_objects
+from torchgrasp.planner.planner import plan_object
 from torchgrasp.planner.ranking import expected_success, rank_together
 from torchgrasp.planner.request import Budget, Observer, Promised, Request, Where
 from torchgrasp.shape.gp import ShapeGP
@@ -340,7 +340,7 @@ def explain_empty(
         shape=shape,
         observer=observer,
     )
-    deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
+    deadline = request.deadline()
     few = dataclasses.replace(request, starts=min(starts, numbers.starts))
     funnel, _, objects = try_request(few, first=request.tell)
     trials = list[Trial]()
@@ -412,12 +412,11 @@ def try_request(
     request: Request,
     known: Objects | None = None,
     first: Observer | None = None,
-    numbers: ExplainNumbers = EXPLAIN,
 ) -> tuple[Funnel, float, Objects]:
     """Return losses, expected success and object of a plan with a small library of postures.
 
     The expected success is the mean, in [0, 1], of the best grasps (`expected_success`), one for
-    every `numbers.judged` initial guesses. Several sets of fingers share the initial guesses; the
+    every `EXPLAIN.judged` initial guesses. Several sets of fingers share the initial guesses; the
     results are those of the best set. If no contact set is found, the most relaxed constraints are
     tried, too. The object is returned as `pose` made it for the last set of fingers.
 
@@ -426,7 +425,6 @@ def try_request(
         known: the object of an earlier plan, whose shape and model are used again; None estimates
             the shape.
         first: observer that is called with "funnel" and the losses of the first plan.
-        numbers: the bounds on the work.
     """
     told = dict[str, Any]()
     hands = request.hands
@@ -437,17 +435,14 @@ def try_request(
     model = find_model(share) if known is None else known.model
     object_ = ShapedObject.of(share) if known is None else known.each[0]
     found = list[tuple[Funnel, float]]()
-    best = max(starts // numbers.judged, 1)
+    best = max(starts // EXPLAIN.judged, 1)
     objects = known
     for hand in hands:
-        objects = pose(object_, share, hand, model, postures=numbers.postures)
+        objects = pose(object_, share, hand, model, postures=EXPLAIN.postures)
         relaxed = list(objects.relaxed_specs())[-1:]
         for spec in (None, *relaxed):
-            tried = objects
-            if spec is not None:
-                tried = objects.posed_again(share, hand, spec, numbers.postures, descends=True)
-            batches = [grasps for (grasps,) in plan_objects(tried, math.inf)]
-            grasps = rank_together(batches, request.order)
+            tried = objects if spec is None else objects.relaxed(spec)
+            grasps = rank_together(list(plan_object(tried, math.inf)), request.order)
             funnel = Funnel.of(told["plan"], told["certify"], told["query"], grasps)
             if not found and first is not None:
                 first("funnel", str(funnel.worst), funnel)

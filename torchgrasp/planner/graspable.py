@@ -13,6 +13,7 @@ from torch import Tensor
 from torchgrasp.cloud.check import FEW_POINTS
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import to_upright, upright_frame
 from torchgrasp.geometry.support_planes import find_table
 from torchgrasp.hand.hand import Hand
@@ -198,7 +199,7 @@ def hand_span(hand: Hand) -> float:
         pads, normals = hand.fingertips(joints)
         # (b, f, f, 3): from each pad to each other
         way = pads[:, None] - pads[:, :, None]
-        distance = torch.linalg.vector_norm(way, dim=-1)
+        distance = norm(way)
         cosine = (normals[:, :, None] * way).sum(-1) / distance.clamp_min(SPAN.least_distance)
         facing = cosine >= hand.tips.cone.cos()[:, None]
         mutual = facing & facing.transpose(1, 2)
@@ -219,13 +220,11 @@ def order_by_ease(scene: Scene) -> list[int]:
     """Return the labels of a scene's objects, the easiest to grasp first.
 
     An object is easy if it is tall, has free space around it, and has nothing above it. The camera
-    should be so near that a pixel on the object is smaller than a contact, and should see more of
+    should be so near that a pixel on the object is smaller than a contact. It should see more of
     the object than fingertips cover. The object's outline in the image should be convex; otherwise
     it may be partly hidden, or be two objects that touch. Objects that are larger than all objects
     in our trials, or that the image border cuts off, come last.
     """
-    from scipy.spatial import ConvexHull, KDTree
-
     points, labels = (x.numpy() for x in _stand_upright(scene))
     # one point of each object in a cell is enough
     cells = np.floor(points / (EASE.side / 2)).astype(np.int64)
@@ -239,28 +238,57 @@ def order_by_ease(scene: Scene) -> list[int]:
     for label in scene.things:
         mine = labels == label
         own = points[mine]
-        beside = np.abs(points - own.mean(0)) < np.ptp(own, 0) + EASE.room
-        near = ~mine & beside.all(1)
-        gap = EASE.room
-        if near.any():
-            gap = KDTree(points[near]).query(own, distance_upper_bound=EASE.room)[0].min()
-        # the lowest point of the object in each column: what is clearly higher lies above it
-        top = np.full(column.max() + 1, np.inf)
-        np.minimum.at(top, column[mine], own[:, 2])
-        above = np.unique(column[~mine & (points[:, 2] > top[column] + EASE.side)])
-        covered = len(above) / len(np.unique(column[mine]))
         height = EASE.height if scene.table is None else np.quantile(own[:, 2], EASE.top)
-        # how much of it the camera sees
+        free = min(_free_space(points, mine) / EASE.room, 1.0) + min(height / EASE.height, 1.0)
+        covered = min(EASE.covered * _covered(points, mine, column), 1.0)
         pixels = scene.pixels[scene.rows_of(label)]
-        pixel = float(scene.image.depth[tuple(pixels.T)].median()) / scene.image.focal
-        seen = len(pixels) * pixel**2 / (3 * math.pi * TIP_RADIUS**2)
-        convex = 0.0
-        if len(pixels) > 2:
-            outline = ConvexHull(pixels.cpu().numpy(), qhull_options="QJ")
-            convex = len(pixels) / outline.volume
-        clear = min(FLAT_RADII[0] / pixel, 1.0) + min(seen, 1.0) + min(convex, 1.0)
-        free = min(gap / EASE.room, 1.0) + min(height / EASE.height, 1.0)
-        ease = free - min(EASE.covered * covered, 1.0) + clear
+        ease = free - covered + _clarity(scene, pixels)
         radius = np.linalg.norm(own - (own.min(0) + own.max(0)) / 2, axis=1).max()
-        rank[label] = (radius > largest_known() or scene.image.at_border(pixels), -ease)
+        last = radius > largest_known() or scene.image.at_border(pixels)
+        rank[label] = (last, -ease)
     return sorted(rank, key=rank.__getitem__)
+
+
+def _free_space(points: np.ndarray, mine: np.ndarray) -> float:
+    """Return the least distance [m] of an object from others, at most `EASE.room`.
+
+    `points` (n, 3) [m] are those of all objects, and `mine` is a mask of the object's own.
+    """
+    from scipy.spatial import KDTree
+
+    own = points[mine]
+    beside = np.abs(points - own.mean(0)) < np.ptp(own, 0) + EASE.room
+    near = ~mine & beside.all(1)
+    if not near.any():
+        return EASE.room
+    return KDTree(points[near]).query(own, distance_upper_bound=EASE.room)[0].min()
+
+
+def _covered(points: np.ndarray, mine: np.ndarray, column: np.ndarray) -> float:
+    """Return the share of an object's columns that have something above them.
+
+    `column` (n,) is the index of each point's column. The other arguments are those of
+    `_free_space`.
+    """
+    # the lowest point of the object in each column: what is clearly higher lies above it
+    top = np.full(column.max() + 1, np.inf)
+    np.minimum.at(top, column[mine], points[mine, 2])
+    above = np.unique(column[~mine & (points[:, 2] > top[column] + EASE.side)])
+    return len(above) / len(np.unique(column[mine]))
+
+
+def _clarity(scene: Scene, pixels: Int[Tensor, "n 2"]) -> float:
+    """Return how clearly the camera sees an object of these pixels, from 0 to 3.
+
+    Pixels should be small beside a contact, cover more than the fingertips, and have a convex
+    outline.
+    """
+    from scipy.spatial import ConvexHull
+
+    pixel = float(scene.image.depth[tuple(pixels.T)].median()) / scene.image.focal
+    seen = len(pixels) * pixel**2 / (3 * math.pi * TIP_RADIUS**2)
+    convex = 0.0
+    if len(pixels) > 2:
+        outline = ConvexHull(pixels.cpu().numpy(), qhull_options="QJ")
+        convex = len(pixels) / outline.volume
+    return min(FLAT_RADII[0] / pixel, 1.0) + min(seen, 1.0) + min(convex, 1.0)

@@ -5,7 +5,6 @@ import dataclasses
 import functools
 import itertools
 import math
-import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -82,8 +81,7 @@ def plan_stacks(
     objects of the next stack are prepared while the device plans.
     """
     most = MANY.stack
-    budget = requests[0].time_budget if requests else None
-    deadline = math.inf if budget is None else time.monotonic() + budget
+    deadline = requests[0].deadline() if requests else math.inf
     stack = _take(prepared, most)
     with ThreadPoolExecutor(1) as beside:
         for first in range(0, len(requests), most):

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import hashlib
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -68,8 +68,16 @@ BURIED = 0.003
 
 CloudIndex = Int[Tensor, "b"]
 """The index of the object (its cloud) to which each of b contact sets or grasps belongs."""
-Model = tuple[GraspMixture | None, str]
-"""The learned mixture of the mode, or None, and the SHA-256 of its file, or "none"."""
+
+
+class LearnedModel(NamedTuple):
+    """The learned posture mixture of a planning mode, and the SHA-256 of its file.
+
+    A mode without one has None and "none".
+    """
+
+    mixture: GraspMixture | None = None
+    sha256: str = "none"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,8 +165,7 @@ class Objects:
         world: what the hand must not touch, in the upright frame.
         loads: w loads of the task for each object (force [N], torque [N m] about the origin of the
             upright frame); None if grasps need not resist loads.
-        model: the learned posture mixture of the mode, None for a mode without one, and the SHA-256
-            of its file.
+        model: the learned model of the mode.
         buried: whether obstacles prevent that the object is lifted.
         descends: whether the hand may move down while it closes.
         postures: size of the posture library; None means the default.
@@ -176,7 +183,7 @@ class Objects:
     body: EstimatedBody
     world: CollisionWorld
     loads: Float[Tensor, "c w 6"] | None
-    model: Model
+    model: LearnedModel
     buried: bool = False
     descends: bool = False
     postures: int | None = None
@@ -251,22 +258,14 @@ class Objects:
         radius = float(self.hand.tips.radius.max())
         return iter(self.given_spec.relaxed(self.spec.ring_radius, radius))
 
-    def posed_again(
-        self,
-        request: Request,
-        hand: Hand,
-        spec: ContactSpec | None = None,
-        postures: int | None = None,
-        descends: bool = False,
-    ) -> "Objects":
-        """Return the same single object for another request, hand or contact constraints.
+    def relaxed(self, spec: ContactSpec) -> "Objects":
+        """Return the same single object with relaxed constraints, one of `relaxed_specs`.
 
-        `spec` holds constraints in the caller's frame, by default those of the request. `postures`
-        is the size of the posture library, None the default. `descends` is whether the hand may
-        move down while it closes.
+        The hand may then move down while it closes.
         """
         (object_,) = self.each
-        return pose(object_, request, hand, self.model, spec, postures, descends)
+        request = self.request
+        return pose(object_, request, self.hand, self.model, spec, self.postures, descends=True)
 
     def reach(
         self, contacts: Contacts, certificate: Certificate, cloud: CloudIndex
@@ -340,7 +339,7 @@ class Objects:
             "ranking": request.order,
             "task": request.grasp_task.describe(),
             "promise": "none" if request.promise is None else describe_promise(request.promise),
-            "mixture_sha256": self.model[1],
+            "mixture_sha256": self.model.sha256,
             "seed": str(request.seed),
         }
         if request.resist is not None:
@@ -369,7 +368,7 @@ def pose(
     object_: ShapedObject,
     request: Request,
     hand: Hand,
-    model: Model,
+    model: LearnedModel,
     spec: ContactSpec | None = None,
     postures: int | None = None,
     descends: bool = False,
@@ -380,8 +379,7 @@ def pose(
         object_: the object, with its shape.
         request: the arguments of the plan.
         hand: the hand of the plan.
-        model: the learned posture mixture of the mode, None for a mode without one, and the SHA-256
-            of its file.
+        model: the learned model of the mode.
         spec: constraints in the caller's frame; by default the request's, on the object's table.
         postures: size of the posture library; None means the default.
         descends: whether the hand may move down while it closes.
@@ -415,7 +413,8 @@ def pose(
         mass = Distribution.of(request.grasp_task.mass).most
         on_table = flat.spec.plane is not None
         loads = loads_of(request.resist, mass, object_.body.center, frame, on_table)[None]
-    mixture = None if model[0] is None else model[0].to(shape.device)
+    if model.mixture is not None:
+        model = model._replace(mixture=model.mixture.to(shape.device))
     return Objects(
         request=request,
         hand=hand,
@@ -429,7 +428,7 @@ def pose(
         body=object_.body,
         world=CollisionWorld(object_.body.field, flat.spec.plane, obstacles),
         loads=loads,
-        model=(mixture, model[1]),
+        model=model,
         buried=is_buried(object_.surface, obstacles),
         descends=descends,
         postures=postures,
@@ -464,12 +463,13 @@ def join_objects(parts: Sequence[Objects], device: torch.device) -> Objects:
     )
 
 
-def find_model(request: Request) -> Model:
-    """Return the learned mixture of the request's hand, if its mode uses one, and the SHA-256 of
-    its file. Raises `BadArgument` for a mode that needs a model which the hand does not have.
+def find_model(request: Request) -> LearnedModel:
+    """Return the learned model of the request's hand, if its mode uses one.
+
+    Raises `BadArgument` for a mode that needs a model which the hand does not have.
     """
     if request.mode == "joint":
-        return None, "none"
+        return LearnedModel()
     folder = request.hand.urdf_path.parent
     # of postures of all sizes alike, so that Eq. (21) knows small objects
     own = folder / "paper.safetensors"
@@ -478,7 +478,7 @@ def find_model(request: Request) -> Model:
         found = f"'{request.mode}' with the {request.hand.name} hand, which has no learned model"
         allowed = "'joint', or a hand whose model `torchgrasp hand train` has learned"
         raise BadArgument("mode", found, allowed)
-    return load_mixture(path), sha256(path)
+    return LearnedModel(load_mixture(path), sha256(path))
 
 
 def is_vague_cloud(cloud: PointCloud) -> bool:

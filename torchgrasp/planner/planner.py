@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import join
+from torchgrasp.foundation.base import join, row_numbers
 from torchgrasp.ik.attempts import (
     Attempts,
     best_grasps,
@@ -83,13 +83,19 @@ def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:
             return
 
 
+def plan_object(objects: Objects, deadline: float) -> Iterator[Grasps]:
+    """Yield the grasps of each batch of the one object in `objects`, as `plan_objects` does."""
+    for (grasps,) in plan_objects(objects, deadline):
+        yield grasps
+
+
 def step(
     objects: Objects, rows: Candidates, tried: int, turn: int, last: bool
 ) -> tuple[Candidates, Grasps, CloudIndex]:
     """Try at most `tried` further contact sets of each object, and return three results.
 
-    They are all contact sets `rows` with the results, the best grasps of those that ended now, and
-    the index of each grasp's object. `turn` is the number of the batch, from 1, and `last` says
+    The first are all contact sets `rows` with the results. The others are the best grasps of those
+    that ended now, and the index of each grasp's object. `turn` is the number of the batch, from 1, and `last` says
     whether it is the last one. In a mode other than "joint", `solve_all` solves for all sets, and
     `rows` stay unchanged.
     """
@@ -134,7 +140,7 @@ def try_fully(
     Return all contact sets `rows` with the results, then the indices of those that ended in this
     batch: those in `ended`, which ended earlier in it, and the new ones. A solved set ends
     (`Row.ENDED`); a failed one gets `Row.STUCK`. `solve_with_sliding` then tries stuck sets, and
-    ends them. It takes long. So in the `last` batch it tries all stuck sets, and in others only
+    ends them. It takes long. So in the `last` batch it tries all stuck sets. In others it tries
     those of objects without a grasp in this batch.
     """
     clouds = len(objects)
@@ -186,7 +192,7 @@ def solve_with_sliding(
     """
     contacts, certificate, seeds = rows.select(now)
     attempts = Attempts(torch.ones_like(certificate.closed), executable)
-    attempts.add(rows.best(now), torch.arange(len(now), device=now.device))
+    attempts.add(rows.best(now), row_numbers(now))
     reach = objects.reach(contacts, certificate, rows.cloud[now])
     solve_sliding(objects.slide(rows.cloud[now]), reach, seeds, attempts)
     grasps, row = best_grasps(attempts)

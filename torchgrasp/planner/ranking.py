@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.resist import resist_loads
-from torchgrasp.foundation.base import join
+from torchgrasp.foundation.base import flatnonzero, join
 from torchgrasp.foundation.errors import Status
 from torchgrasp.ik.motion import collision_probability
 from torchgrasp.planner.objects import CloudIndex, Objects
@@ -49,7 +49,7 @@ def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
         grasps = dataclasses.replace(grasps, status=lost)
     grasps = objects.on_arm(grasps)
     grasps = prove_resistance(objects, grasps, cloud)
-    rows = torch.nonzero(grasps.status == Status.OK)[:, 0]
+    rows = flatnonzero(grasps.status == Status.OK)
     log_odds, covered = predict(objects, grasps[rows], cloud[rows])
     # the host sorts
     cpu = torch.device("cpu")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -85,11 +86,10 @@ class Request:
     def __post_init__(self) -> None:
         """Raise `BadArgument` for arguments that contradict each other.
 
-        These are an arm of another hand, no load to resist, and a box or mesh to keep to that is
-        not at the object. A `promise` (the share of returned grasps that hold) contradicts a
-        displaced object.
-        A box or mesh to avoid that is not at the object raises the warning `NoEffect`, and so does
-        one to keep to that holds the whole object.
+        These are an arm of another hand, no load to resist, and a box or mesh to keep to off the
+        object. A `promise` (the share of returned grasps that hold) contradicts a displaced object.
+        The warning `NoEffect` tells of a box or mesh that changes nothing. One to avoid is off the
+        object, or one to keep to holds all of it.
         """
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
             raise BadArgument(
@@ -105,6 +105,12 @@ class Request:
                 check_where(name, region, self._seen)
         if self.promise is not None and self.grasp_task.displaced:
             raise BadArgument("promise", f"{self.promise:g} for a displaced object", "None")
+
+    def deadline(self) -> float:
+        """Return the time of `time.monotonic` [s] after which no batch begins, if planning begins
+        now; infinite without a budget.
+        """
+        return math.inf if self.time_budget is None else time.monotonic() + self.time_budget
 
     def tell(self, stage: str, message: str, value: Any) -> None:
         """Report a stage to the observer, if there is one.
@@ -154,8 +160,8 @@ def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tu
     """Return one hand for each set of fingers to plan with.
 
     `fingers` "auto" gives all sets that the hand declares; a name or number gives that set; None
-    gives the hand as it is. Raises `BadArgument` for fingers that the hand does not have, and for
-    more than three fingers, or "auto", in a mode other than "joint".
+    gives the hand as it is. Raises `BadArgument` for fingers that the hand does not have. In a mode
+    other than "joint", it is raised for more than three fingers, or "auto", too.
     """
     if fingers == "auto":
         if mode != "joint":

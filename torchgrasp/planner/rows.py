@@ -17,7 +17,14 @@ from torchgrasp.contacts.plan import plan_chunk, stages_for
 from torchgrasp.contacts.problem import rows_of
 from torchgrasp.contacts.resist import resist_loads, share_carried
 from torchgrasp.contacts.starts import STARTS_PER_CHUNK
-from torchgrasp.foundation.base import at_once, flatnonzero, join, lexical_order, rank_in_group
+from torchgrasp.foundation.base import (
+    at_once,
+    flatnonzero,
+    join,
+    lexical_order,
+    rank_in_group,
+    row_numbers,
+)
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import Count
@@ -75,9 +82,9 @@ class Candidates:
         contacts: the contact sets, points [m] in the upright frame.
         certificate: the proofs of force closure.
         seeds: initial hand postures; `seeds.row` is the index of each one's contact set.
-        load: of the task's wrenches [N, N m] about the centroid of the contacts, the one that needs
-            the largest share of the greatest finger forces. Without loads the weight in a lift, else
-            0.
+        load: the wrench [N, N m] about the contacts' centroid that is hardest to resist. It needs
+            the largest share of the greatest finger forces, of all wrenches of the task. Without
+            loads it is the weight in a lift, else 0.
         cost: cost (no unit; less is better) by which the next contact sets to try are chosen.
         cloud: index of each contact set's object.
         status: a `Row` for each contact set.
@@ -130,7 +137,7 @@ class Candidates:
         chosen = self.status == status
         if clouds is not None:
             chosen = chosen & clouds[self.cloud]
-        rows = torch.nonzero(chosen)[:, 0]
+        rows = flatnonzero(chosen)
         return rows[torch.argsort(self.turn[rows], stable=True)]
 
     def select(self, rows: Int[Tensor, "k"]) -> tuple[Contacts, Certificate, IKSeeds]:
@@ -140,7 +147,7 @@ class Candidates:
         The `row` of the initial postures is an index among these k.
         """
         number = rows.new_full((len(self),), -1)
-        number[rows] = torch.arange(len(rows), device=rows.device)
+        number[rows] = row_numbers(rows)
         seeds = self.seeds[number[self.seeds.row] >= 0]
         seeds = seeds[torch.argsort(number[seeds.row], stable=True)]
         seeds = dataclasses.replace(seeds, row=number[seeds.row])
@@ -241,17 +248,17 @@ def find_candidates(
 
     Of the successful sets of each object, at most `most` are chosen, which lie far apart. In mode
     "paper" with ranking "variance" all are chosen, the most certain first. Chosen sets without
-    force closure are left out. If there are loads, a set that not even the greatest finger forces
-    resist gets the status `NOT_RESISTED` in the plan, and is not chosen. The costs are 0 until
-    `with_costs` sets them.
+    force closure are left out. A set whose greatest finger forces do not resist the loads gets the
+    status `NOT_RESISTED` in the plan, and is not chosen. The costs are 0 until `with_costs` sets
+    them.
 
     Args:
         objects: the objects of the plan.
         plan: the planned contact sets.
         cloud: index of each planned set's object.
         most: largest number of sets that are chosen for each object.
-        note: function that is called with the name and the result of each of the stages "plan",
-            "certify" and "query", such as `Report.note`.
+        note: function that is called after each of the stages "plan", "certify" and "query", with
+            the stage's name and result, such as `Report.note`.
     """
     request = objects.request
     load = plan.contacts.points.new_zeros(len(plan), 6)
@@ -263,12 +270,12 @@ def find_candidates(
     if request.mode == "paper" and request.order == "variance":
         variance = plan.contacts.variance
         assert variance is not None
-        rows = torch.nonzero(plan.status == Status.OK)[:, 0]
+        rows = flatnonzero(plan.status == Status.OK)
         rows = rows[torch.argsort(variance[rows].sum(1), stable=True)]
     else:
         rows = _spread(plan, cloud, most, len(objects))
     certificate = certify(plan.contacts[rows], objects.spec)
-    closed = torch.nonzero(certificate.closed)[:, 0]
+    closed = flatnonzero(certificate.closed)
     certificate = certificate[closed]
     kept = rows[closed]
     contacts = plan.contacts[kept]
@@ -286,7 +293,7 @@ def _drop_weak(
     each set.
     """
     assert objects.loads is not None
-    rows = torch.nonzero(plan.status == Status.OK)[:, 0]
+    rows = flatnonzero(plan.status == Status.OK)
     points = plan.contacts.points[rows]
     normals = plan.contacts.normals[rows]
     full = torch.full_like(points[..., 0], objects.strongest)
@@ -298,7 +305,7 @@ def _drop_weak(
 
 def _spread(plan: ContactPlan, cloud: CloudIndex, most: int, clouds: int) -> Int[Tensor, "k"]:
     """Return at most `most` successful contact sets of each cloud that lie far apart."""
-    solved = torch.nonzero(plan.status == Status.OK)[:, 0]
+    solved = flatnonzero(plan.status == Status.OK)
     own = by_cloud(cloud[solved], clouds)
     if max(map(len, own)) > most:  # the host chooses
         found = plan[solved].to("cpu")
@@ -311,7 +318,7 @@ def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
     """Return the indices of at most `most` successful contact sets of a plan that lie far apart,
     ascending.
     """
-    rows = torch.nonzero(plan.status == Status.OK)[:, 0]
+    rows = flatnonzero(plan.status == Status.OK)
     if len(rows) <= most:
         return rows
     first = int(plan.quality[rows].argmin())
@@ -325,7 +332,7 @@ def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSee
 
     In mode "joint" they are random postures, in other modes those of the learned model.
     """
-    mixture = objects.model[0]
+    mixture = objects.model.mixture
     if mixture is None:
         world = objects.world.rows(cloud)
         return nearest_postures(objects.library, contacts, world, reachable=objects.reachable)
@@ -337,13 +344,13 @@ def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSee
 def with_costs(objects: Objects, found: Candidates) -> Candidates:
     """Return `found` with the cost of each contact set (no unit; less is better).
 
-    The cost is log(max(e, `CHOICE.touching`)) + `CHOICE.lever` log(a + `CHOICE.short`). Here e is
-    the least of the `seed_costs` [mm2] of the set's first `CHOICE.tried` initial postures, infinite
-    if it has none, and a its lever arm (`lever_arm`).
+    The cost is log(max(e, `CHOICE.touching`)) + `CHOICE.lever` log(a + `CHOICE.short`). Here a is
+    the set's lever arm (`lever_arm`). e is the least of the `seed_costs` [mm2] of its first
+    `CHOICE.tried` initial postures, and infinite without any.
 
-    With loads to resist, or a weight to lift, the initial postures of each set are first sorted by
-    the share of the load that they carry, at most 1, the greatest share first. A set whose postures
-    all carry less than the load costs from `CHOICE.weak` to 2 `CHOICE.weak` more. A weight meets
+    With loads to resist, or a weight to lift, the initial postures of each set are sorted first.
+    The greatest share of the load that they carry, at most 1, comes first. A set whose postures all
+    carry less than the load costs from `CHOICE.weak` to 2 `CHOICE.weak` more. A weight meets
     all of the mean friction: without it, two fingers at a thin wall and one on the floor of a pan
     would do.
     """
@@ -392,14 +399,14 @@ def _carried(objects: Objects, found: Candidates, spec: ContactSpec) -> Float[Te
 def choose(rows: Candidates, most: int, clouds: int) -> Int[Tensor, "k"]:
     """Return the indices of the next contact sets to try: at most `most` of each object.
 
-    Farthest-point sampling chooses them among the untried sets of low cost, far from each other and
-    from the sets that were tried before. `rows` are all contact sets, and `clouds` is the number of
+    Farthest-point sampling chooses them among the untried sets of low cost. They are far from each
+    other, and from the sets that were tried before. `rows` are all contact sets, and `clouds` is the number of
     objects. All objects are sampled at once, on their device.
     """
     if not len(rows):
         return rows.cloud
     points = sorted_points(rows.contacts)
-    before = torch.nonzero(rows.turn > 0)[:, 0]
+    before = flatnonzero(rows.turn > 0)
     cost = rows.cost.index_fill(0, before, torch.inf)
     # the cheapest rows of each cloud, (c, m)
     table, held = _table(rows.cloud, clouds)
@@ -423,7 +430,7 @@ def choose(rows: Candidates, most: int, clouds: int) -> Int[Tensor, "k"]:
     chosen = index.gather(1, torch.cat(picks, 1))
     known = torch.arange(chosen.shape[1], device=index.device) < likely.sum(1, keepdim=True)
     chosen = torch.where(known, chosen, len(rows)).sort(1).values.flatten()
-    return chosen[torch.nonzero(chosen < len(rows))[:, 0]]
+    return chosen[flatnonzero(chosen < len(rows))]
 
 
 def _are_likely(cost: Float[Tensor, "*c m"], most: int) -> Bool[Tensor, "*c m"]:
@@ -441,7 +448,7 @@ def _table(cloud: CloudIndex, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Ten
     """
     count = torch.bincount(cloud, minlength=clouds)
     table = cloud.new_zeros(clouds, int(count.max()))
-    table[cloud, rank_in_group(cloud)] = torch.arange(len(cloud), device=cloud.device)
+    table[cloud, rank_in_group(cloud)] = row_numbers(cloud)
     return table, torch.arange(table.shape[1], device=cloud.device) < count[:, None]
 
 

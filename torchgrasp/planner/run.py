@@ -3,6 +3,7 @@ best set's plan counts.
 """
 
 import dataclasses
+import itertools
 import math
 import time
 from collections.abc import Iterator
@@ -14,14 +15,8 @@ from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.attempts import executable
-from torchgrasp.planner.objects import (
-    Objects,
-    ShapedObject,
-    find_model,
-    pose,
-    pose_request,
-)
-from torchgrasp.planner.planner import plan_objects
+from torchgrasp.planner.objects import Objects, ShapedObject, find_model, pose, pose_request
+from torchgrasp.planner.planner import plan_object
 from torchgrasp.planner.ranking import expected_success, rank_together
 from torchgrasp.planner.report import describe
 from torchgrasp.planner.request import Request
@@ -73,8 +68,7 @@ def plan_hand(objects: Objects, deadline: float) -> Iterator[Grasps]:
     If no grasp is likely to hold, further batches are planned with relaxed constraints (`relax`).
     No batch begins after `deadline` [s], a time of `time.monotonic`.
     """
-    batches = (grasps for (grasps,) in plan_objects(objects, deadline))
-    yield from relax(objects, batches, deadline)
+    yield from relax(objects, plan_object(objects, deadline), deadline)
 
 
 def relax(objects: Objects, batches: Iterator[Grasps], deadline: float) -> Iterator[Grasps]:
@@ -90,25 +84,18 @@ def relax(objects: Objects, batches: Iterator[Grasps], deadline: float) -> Itera
     """
     failed = list[Grasps]()
     best = 0.0
-    relaxed = objects.relaxed_specs()
-    while True:
+    relaxed = (plan_object(objects.relaxed(spec), deadline) for spec in objects.relaxed_specs())
+    for attempt in itertools.chain([batches], relaxed):
         failed.clear()
-        for grasps in batches:
-            good = grasps[executable(grasps)]
+        for grasps in attempt:
             failed.append(grasps)
+            good = grasps[executable(grasps)]
             if len(good):
                 best = max(best, float(torch.sigmoid(good.score).max()))
                 yield from failed
                 failed.clear()
         if best > LIKELY or objects.buried or time.monotonic() >= deadline:
             break
-        spec = next(relaxed, None)
-        if spec is None:
-            break
-        objects = objects.posed_again(
-            objects.request, objects.hand, spec, objects.postures, descends=True
-        )
-        batches = (grasps for (grasps,) in plan_objects(objects, deadline))
     yield from failed
 
 
@@ -116,9 +103,7 @@ def _plan_batches(request: Request) -> Iterator[Grasps]:
     """Yield the grasps of each batch in the request's frame; several sets of fingers give one
     batch.
     """
-    deadline = math.inf
-    if request.time_budget is not None:
-        deadline = time.monotonic() + request.time_budget
+    deadline = request.deadline()
     hands = request.hands
     if len(hands) == 1:
         objects = pose_request(request, hands[0])

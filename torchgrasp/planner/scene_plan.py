@@ -111,8 +111,8 @@ def plan_scene(
     """Plan grasps of the objects in a scene; return a plan for each, the greatest predicted success
     first.
 
-    Nothing is planned for an object if its image shows that it cannot be grasped
-    (`Status.FEW_PIXELS` to `TOO_WIDE`), or if its estimated shape is `TOO_VAGUE`. Of the other
+    Nothing is planned for an object whose image shows that it cannot be grasped
+    (`Status.FEW_PIXELS` to `TOO_WIDE`). The same holds for a shape that is `TOO_VAGUE`. Of the other
     objects, near and tall ones with free space around them are planned first. Objects at the image
     border, or too large for a prediction of success, are planned last.
 

@@ -47,23 +47,23 @@ def batch_sizes(mode: Mode, starts: int, crowded: bool) -> list[BatchSize]:
     return schedule(starts, most) if mode == "joint" else [BatchSize(starts, most)]
 
 
-def schedule(starts: int, most: int, numbers: ScheduleNumbers = SCHEDULE) -> list[BatchSize]:
+def schedule(starts: int, most: int) -> list[BatchSize]:
     """Return the sizes of batches with `starts` initial guesses, and `most` contact sets for the
     hand, in all.
 
     A small remainder joins the last batch.
     """
     batches = list[BatchSize]()
-    size = numbers.first
+    size = SCHEDULE.first
     most = min(most, starts)
     tried = 0
     planned = 0
     while tried < most:
         size = size if most - tried >= 2 * size else most - tried
         tried += size
-        wanted = max(numbers.offered * tried, starts * tried // most)
+        wanted = max(SCHEDULE.offered * tried, starts * tried // most)
         further = min(starts, wanted) - planned
         batches.append(BatchSize(further, size))
         planned += further
-        size *= numbers.growth
+        size *= SCHEDULE.growth
     return batches

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value, at_once, rank_in_group, spread
+from torchgrasp.foundation.base import Value, at_once, flatnonzero, rank_in_group, spread
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.shape.estimate import MeanAndGradient, MeanJet, Moments, SurfaceJet
 from torchgrasp.shape.gp import ShapeGP
@@ -92,7 +92,7 @@ class Walls(Value):
             # rows of what is missing come last
             missing = torch.ones(size, dtype=torch.bool, device=x.device)
             missing = missing.index_fill(0, rows, False)
-            place_of[w] = torch.cat([shape.ordered(rows), torch.nonzero(missing)[:, 0]])
+            place_of[w] = torch.cat([shape.ordered(rows), flatnonzero(missing)])
         x, a, b, psi, counts, place_of = (y.to(device) for y in (x, a, b, psi, counts, place_of))
         # no column for what is missing
         known = torch.arange(size, device=device) < counts[:, None]

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import Batch, Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Positive
-from torchgrasp.geometry.linalg import Points, unit
+from torchgrasp.geometry.linalg import Points, norm, unit
 from torchgrasp.shape.kernel import Queries
 
 MeanAndGradient = tuple[Float[Tensor, "q"], Queries]
@@ -187,7 +187,7 @@ class MeanJet(Batch):
         Here n is the normal, H the Hessian and g the gradient.
         """
         n = self.normals
-        steep = torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
+        steep = norm(self.gradient)[..., None, None]
         along = n[..., :, None] * (n[..., None, :] @ self.hessian)
         return (self.hessian - along) / steep
 
@@ -260,4 +260,4 @@ def surface_deviation(
 
     It is linearised: the root of the distance's `variance` over the length of its `gradient`.
     """
-    return variance.sqrt() / torch.linalg.vector_norm(gradient, dim=-1)
+    return variance.sqrt() / norm(gradient)

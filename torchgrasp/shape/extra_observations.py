@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.cloud.prepare import PreparedCloud
-from torchgrasp.foundation.base import Value, join
-from torchgrasp.geometry.linalg import Points, fibonacci_sphere, unit
+from torchgrasp.foundation.base import Value, flatnonzero, join
+from torchgrasp.geometry.linalg import Points, fibonacci_sphere, norm, unit
 from torchgrasp.shape.completion.complete import HIDDEN, Completion, Kind, correlated_errors
 from torchgrasp.shape.completion.silhouette import (
     OUTLINE,
@@ -184,7 +184,7 @@ def paper_support(
     normals. `generator` draws the points.
     """
     center = seen.points.mean(0)
-    scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
+    scale = float(norm(seen.points - center).max())
     draws = torch.randn(OUTSIDE.points, 3, dtype=torch.float64, device="cpu", generator=generator)
     sphere = unit(draws).to(center)
     x = torch.cat([torch.zeros_like(center)[None], OUTSIDE.radius * sphere])
@@ -198,7 +198,7 @@ def frame_around(points: Points) -> Normalisation:
     Its origin is in the centre of their box, and its scale is the distance of the farthest point.
     """
     center = find_middle(points)
-    scale = float(torch.linalg.vector_norm(points - center, dim=-1).max())
+    scale = float(norm(points - center).max())
     return Normalisation(center, scale)
 
 
@@ -234,7 +234,7 @@ def camera_support(
         parts = _observe_completion(completion, frame)
         reach = 1.0
         if completion.frame:
-            reach = float(torch.linalg.vector_norm(frame.normalise(surface), dim=-1).max())
+            reach = float(norm(frame.normalise(surface)).max())
         error = FREE.estimated_error if seen.estimated else FREE.outline_error
         free = free_space(completion.outline, frame, table, reach, error)
         # the centre of an arch or of a bowl is not inside
@@ -437,7 +437,7 @@ def free_space(
             points = torch.cat([points, torch.cat([ground, height], 1)])
             least = torch.cat([least, torch.full_like(ground[:, 0], below)])
     x = (points - origin) / scale
-    near = torch.linalg.vector_norm(x, dim=-1) < FREE.radius
+    near = norm(x) < FREE.radius
     keep = near & (least > FREE.least)
     x = x[keep].to(frame.center)
     least = least[keep].to(frame.center)
@@ -455,7 +455,7 @@ def free_space_violations(
     `x` are n normalised points, and `least` the lower bounds of their signed distances, normalised.
     """
     short = shape.mean(x) - least
-    rows = torch.nonzero(short < -FREE.violation / shape.scale)[:, 0]
+    rows = flatnonzero(short < -FREE.violation / shape.scale)
     rows = rows[torch.argsort(short[rows], stable=True)]
     return rows[pick_apart(x[rows], FREE.violations)]
 

@@ -43,7 +43,7 @@ from torchgrasp.shape.extra_observations import (
 )
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.hollow import HollowShape, tie_walls
-from torchgrasp.shape.kernel import Kernel, KernelName, is_plain, kernel_by_name
+from torchgrasp.shape.kernel import Kernel, KernelName, is_plain, kernel_of
 from torchgrasp.values.planning import PointCloud
 
 
@@ -163,6 +163,13 @@ class FitOptions:
     kernel: KernelName | Kernel = "thin_plate"
     criterion: Criterion = "variance"  # what is greatest at the most informative point
 
+    def selected(self) -> tuple[int, float]:
+        """Return the number of observed points, and the variance at which their selection ends."""
+        if self.budget == "sure":
+            return SHAPE.budget, self.noise
+        usual = SHAPE.camera if self.support == "camera" else SHAPE.paper
+        return self.budget or usual, -math.inf
+
 
 def fit_upright(
     cloud: PointCloud,
@@ -231,6 +238,7 @@ def _fit_surface(seen: PreparedCloud, support: ExtraObservations, options: FitOp
         points = points[support.rows]
         normals = normals[support.rows]
         cloud = PointCloud(points.to(cloud.points), normals.to(cloud.points))
+    # an uncertain pose of a view adds to the noise of its points
     x = support.frame.normalise(points)
     noise = torch.full_like(x[:, 0], options.noise)
     error = seen.pose_error
@@ -243,16 +251,9 @@ def _fit_surface(seen: PreparedCloud, support: ExtraObservations, options: FitOp
     # last.
     every = join([support.anchors, candidates, *(part for part, _ in support.parts)])
     psi = options.psi_scale * longest_distance(every.x)
-    kernel = (
-        kernel_by_name(options.kernel, psi) if isinstance(options.kernel, str) else options.kernel
-    )
-    usual = SHAPE.camera if options.support == "camera" else SHAPE.paper
-    stop = -math.inf
-    budget = options.budget or usual
-    if budget == "sure":
-        budget = SHAPE.budget
-        stop = options.noise
-    budget = max(budget - len(support.anchors), 1)
+    kernel = kernel_of(options.kernel, psi)
+    most, stop = options.selected()
+    budget = max(most - len(support.anchors), 1)
     posterior = select_points(
         candidates, support.anchors, kernel, budget, options.criterion, stop
     ).posterior
@@ -317,8 +318,7 @@ def condition(
             raise BadArgument(f"observations.{name}", "a tensor inside torch.vmap", allowed)
     observations = observations.to(normalisation.center.device, torch.float64)
     psi = psi_scale * longest_distance(observations.x)
-    kernel = kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
-    posterior = posterior_given(observations, kernel)
+    posterior = posterior_given(observations, kernel_of(kernel, psi))
     if is_known(posterior.factor):
         check_kernel(posterior, observations.least_noise)
     return ShapeGP.of(posterior, normalisation, cloud, psi, std_factor)

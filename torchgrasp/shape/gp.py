@@ -17,7 +17,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Pose, Positive, Range, Seed, check_moved, is_known
 from torchgrasp.geometry.frames import apply
-from torchgrasp.geometry.linalg import Points, cholesky, unit, unit_of_any
+from torchgrasp.geometry.linalg import Points, cholesky, norm, unit, unit_of_any
 from torchgrasp.geometry.plane import move
 from torchgrasp.shape.conditioning import append_observations
 from torchgrasp.shape.estimate import (
@@ -127,7 +127,7 @@ class ShapeGP(Posterior, Normalisation):
             std_factor: ratio of the surface's true deviations to the posterior's standard
                 deviations.
         """
-        away = torch.linalg.vector_norm(posterior.x.detach(), dim=-1)
+        away = norm(posterior.x.detach())
         reach = DOMAIN.reach * float(away.max())
         radius = min(posterior.kernel.diameter / 2.0, reach)
         fields = common_fields(posterior, Posterior) | common_fields(frame, Normalisation)
@@ -177,7 +177,7 @@ class ShapeGP(Posterior, Normalisation):
         The domain is the ball in which the posterior is valid: `domain_radius` around `center`. b
         stands for any batch axes.
         """
-        return torch.linalg.vector_norm(self.normalise(points), dim=-1) <= self.domain_radius
+        return norm(self.normalise(points)) <= self.domain_radius
 
     @checked(gradients=True)
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
@@ -223,7 +223,7 @@ class ShapeGP(Posterior, Normalisation):
         torch.Size([4, 3, 3])
         """
         jet = self.jet(self._queries(points))
-        length = torch.linalg.vector_norm(jet.gradient, dim=-1)[:, None, None]
+        length = norm(jet.gradient)[:, None, None]
         normal = jet.gradient[:, :, None] / length
         steeper = normal.transpose(1, 2) @ jet.hessian  # the derivative of the slope
         along = normal @ steeper
@@ -405,7 +405,7 @@ class ShapeGP(Posterior, Normalisation):
         flat = points.reshape(-1, 3)
         radius = reach * self.domain_radius
         x = self.normalise(flat.double().to(self.device))
-        away = torch.linalg.vector_norm(x.detach(), dim=-1)
+        away = norm(x.detach())
         outside = away > radius
         if is_known(outside) and bool(outside.any()):
             first = int(torch.nonzero(outside)[0])
@@ -425,7 +425,7 @@ class ShapeGP(Posterior, Normalisation):
         domain's diameter of the centre a ball of the domain's size holds both, and in such a ball
         the kernel is a covariance.
         """
-        length = torch.linalg.vector_norm(x.detach(), dim=-1, keepdim=True)
+        length = norm(x.detach(), keepdim=True)
         outside = length > self.domain_radius
         if not (is_known(outside) and bool(outside.any())):
             return self.estimate(x)

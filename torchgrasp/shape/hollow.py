@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.foundation.base import map_tensors
+from torchgrasp.foundation.base import flatnonzero, map_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.shape.completion.silhouette import pick_apart
@@ -233,7 +233,7 @@ class HollowShape(ShapeGP):
             inner = self.wall_at(x)[:, 1]
             walls = [evaluate(wall, x) for wall in self.walls]
             return walls, lambda a, b: torch.where(inner.reshape(-1, *[1] * (a.ndim - 1)), b, a)
-        rows = [torch.nonzero(own)[:, 0] for own in self.wall_at(x).T]
+        rows = [flatnonzero(own) for own in self.wall_at(x).T]
         back = torch.argsort(torch.cat(rows))
         walls = [evaluate(wall, x[own]) for wall, own in zip(self.walls, rows, strict=True)]
         return walls, lambda *parts: torch.cat(parts)[back]
@@ -254,7 +254,7 @@ def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
         distance = torch.stack([wall.mean(x) for wall in shape.walls])
         short = distance.sum(0) + thickness
         off = torch.where(middle.side, short.abs(), short)
-        rows = torch.nonzero(off > TIE_WALLS.off / shape.scale)[:, 0]
+        rows = flatnonzero(off > TIE_WALLS.off / shape.scale)
         if not len(rows):
             break
         rows = rows[torch.argsort(off[rows], descending=True, stable=True)]

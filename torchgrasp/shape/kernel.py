@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import LEAST, Positive, Range, is_known, is_tracked
-from torchgrasp.geometry.linalg import Points
+from torchgrasp.geometry.linalg import Points, eye_like
 
 Profile = Callable[[Tensor], Tensor]
 """A radial kernel k(r), elementwise. It is smooth where r > 0, four times differentiable at 0 from
@@ -274,6 +274,13 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     return Kernel(profile, closed_form=closed_form)
 
 
+def kernel_of(kernel: KernelName | Kernel, psi: float) -> Kernel:
+    """Return a kernel, given itself or by its name; the length of one by name follows from
+    `psi`.
+    """
+    return kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
+
+
 @checked
 def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
     """Return a kernel by its name; its length follows from `psi`, a normalised length.
@@ -341,7 +348,7 @@ def _differentiable_cross_covariance(
     k, first, second = (f[..., None] for f in differentiate(kernel.profile, u, 3))
     near = d[:, :n_oriented]
     slope = -first[:, :n_oriented]
-    one = torch.eye(3, dtype=x.dtype, device=x.device)
+    one = eye_like(3, x)
     tilted = second[:, :n_oriented, :, None] * near[..., :, None]
     bent = slope[..., None] * one - tilted * near[..., None, :]  # (q, n_oriented, 3, 3)
     with_distances = torch.cat([k, first * d], -1).permute(2, 0, 1)

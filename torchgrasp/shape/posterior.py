@@ -14,7 +14,7 @@ from torchgrasp.foundation.base import Value, at_once, in_chunks, kept
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import IndefiniteCovariance
 from torchgrasp.foundation.rules import is_known
-from torchgrasp.geometry.linalg import Points
+from torchgrasp.geometry.linalg import Points, norm
 from torchgrasp.shape.estimate import JointEstimate, MeanAndGradient, MeanJet, Moments, SurfaceJet
 from torchgrasp.shape.jets import (
     Weighted,
@@ -357,11 +357,11 @@ def combined_covariance(
     sums = (weights @ cross).view(b * v, rows)
     whitened = posterior.whiten(sums).view(b, v, rows)
     offset = points[:, :, None] - points[:, None]
-    apart = torch.linalg.vector_norm(offset, dim=-1)
+    apart = norm(offset)
     if not is_plain(points):
         # the length of a zero vector has no second derivative, and counts as constant here
         same = (offset == 0).all(-1)
-        apart = torch.linalg.vector_norm(torch.where(same[..., None], 1.0, offset), dim=-1)
+        apart = norm(torch.where(same[..., None], 1.0, offset))
         apart = torch.where(same, 0.0, apart)
     prior = posterior.kernel.profile(apart)  # (b, g p, g p)
     prior = weights @ prior.view(b, g, p, g * p)  # (b, g, m, g p)

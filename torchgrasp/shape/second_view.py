@@ -8,13 +8,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.cloud.camera import look_at
-from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Length, Measured, Pose
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse
-from torchgrasp.geometry.linalg import Points, Vector, unit
+from torchgrasp.geometry.linalg import Points, Vector, norm, unit
 from torchgrasp.geometry.plane import Plane, as_plane, upright_frame
 from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
 from torchgrasp.shape.completion.silhouette import find_middle, pick_apart
@@ -148,7 +148,7 @@ def next_view(
     targets, weights = _contacts(shape, grasps, frame)
     surface = extract_surface(shape, VIEW.resolution)
     # the surface may end a little outside the domain, where the posterior is unknown
-    inside = torch.nonzero(shape.contains(surface.vertices))[:, 0]
+    inside = flatnonzero(shape.contains(surface.vertices))
     rows = inside[pick_apart(surface.vertices[inside], VIEW.points)]
     points = surface.vertices[rows]
     if len(targets) == 0:
@@ -179,7 +179,7 @@ def find_seen(
     """
     offset = eyes[:, None] - points
     towards = unit(offset)
-    length = torch.linalg.vector_norm(offset, dim=-1)
+    length = norm(offset)
     seen = (towards * normals).sum(-1) > VIEW.least_cosine
     # only rays of surface that faces the camera are followed: (r,)
     ray = torch.nonzero(seen, as_tuple=True)
@@ -209,7 +209,7 @@ def expect_deviation(
     joint = shape.joint(torch.cat([points, targets]).double())
     total = len(joint.mean)
     covariance = joint.covariance.reshape(total, 4, total, 4)[:, 0, :, 0]
-    slope = torch.linalg.vector_norm(joint.mean[count:, 1:], dim=-1)
+    slope = norm(joint.mean[count:, 1:])
     unseen = covariance.new_full(seen.shape, VIEW.unseen**2)
     variance = unseen.masked_fill(seen, VIEW.noise**2)
     measured = covariance[:count, :count] + torch.diag_embed(variance)  # (v, n, n)
@@ -286,4 +286,4 @@ def _distance(shape: ShapeGP, middle: Vector, distance: float | None) -> float:
     before = _eyes(shape)
     if not len(before):
         return max(least, VIEW.far)
-    return max(least, float(torch.linalg.vector_norm(before - middle, dim=-1).mean()))
+    return max(least, float(norm(before - middle).mean()))

@@ -19,7 +19,7 @@ from torchgrasp.foundation.errors import BadArgument, SuspiciousScale
 from torchgrasp.foundation.lazy import ndimage, spatial, trimesh
 from torchgrasp.foundation.rules import Range
 from torchgrasp.foundation.threads import single_threaded
-from torchgrasp.geometry.linalg import Points, limit_norm, number_components, unit
+from torchgrasp.geometry.linalg import Points, limit_norm, norm, number_components, unit
 from torchgrasp.geometry.mesh import clip_mesh
 from torchgrasp.geometry.signed_distance import (
     FIELD_SPACING,
@@ -224,7 +224,7 @@ def _trace_wall(
         motion = newton_step(value, gradient, step, SURFACE.least_slope)
         x[rows] = x[rows] + motion
         normals[rows] = gradient
-        rows = rows[torch.linalg.vector_norm(motion, dim=-1) > SURFACE.settled]
+        rows = rows[norm(motion) > SURFACE.settled]
     if others:  # the cut turns triangles around, so they are wound after it
         value = torch.stack([wall.mean(x) for wall in others]).amax(0)
         parts = [part.cpu().numpy() for part in (x, faces, value)]

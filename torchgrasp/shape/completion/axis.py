@@ -20,6 +20,7 @@ from torchgrasp.geometry.linalg import (
     Points,
     across,
     fibonacci_sphere,
+    norm,
     solve_least_squares,
     unit,
 )
@@ -181,7 +182,7 @@ class _Lines(NamedTuple):
 
 def _lines_from_above(points: Points, normals: Points) -> _Lines:
     """Return the lines through points along their normals, projected onto the horizontal plane."""
-    slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
+    slope = norm(normals[:, :2])
     steep = slope > AXIS_FIT.steep
     level = normals[:, :2] / slope[:, None]
     level = torch.where(steep[:, None], level, 0.0)
@@ -214,7 +215,7 @@ def _round_body(
     typical radius at its height.
     """
     miss = lines.offset - lines.across @ center
-    radius = torch.linalg.vector_norm(points[:, :2] - center, dim=1)
+    radius = norm(points[:, :2] - center)
     meets = lines.steep & (miss.abs() / radius.clamp_min(ROUND.least_radius) < ROUND.miss)
     slices = ((points[:, 2:] - points[:, 2]).abs() < ROUND.near) & meets  # (n, n)
     typical = torch.where(slices, radius, torch.nan).nanmedian(1).values
@@ -223,7 +224,7 @@ def _round_body(
     mask = torch.where(lines.steep, wall, radius < typical + ROUND.near)
     side = mask & lines.steep
     spread = (miss / allowed(radius, typical))[side].square().mean().sqrt()
-    one_way = torch.linalg.vector_norm(lines.level[side].mean(0))
+    one_way = norm(lines.level[side].mean(0))
     enough = mask.double().mean() > ROUND.body_share
     return mask if bool(enough & (spread < 1.0) & (one_way < ROUND.one_way)) else None
 
@@ -256,7 +257,7 @@ def _fit_axis(
         system = system + AXIS_FIT.damping * torch.diag_embed(diagonal)
         found = -torch.linalg.solve(system, (weighted * miss[..., None]).sum(1))
         turn = found[:, 2:]
-        length = torch.linalg.vector_norm(turn, dim=1, keepdim=True)
+        length = norm(turn, keepdim=True)
         turn = turn * (AXIS_FIT.turn / length.clamp_min(AXIS_FIT.turn))
         center = center + (found[:, None, :2] @ axes)[:, 0]
         direction = unit(direction + (turn[:, None] @ axes)[:, 0])
@@ -277,8 +278,8 @@ def _frame(
     """
     eye = torch.stack([view.viewpoint for view in outline.views]).mean(0) - center
     level = eye - (eye @ direction) * direction
-    length = torch.linalg.vector_norm(level)
-    tilted = length > LEAST_TILT * torch.linalg.vector_norm(eye)
+    length = norm(level)
+    tilted = length > LEAST_TILT * norm(eye)
     x = level / length if tilted else across(direction)[0]
     rotation = torch.stack([x, torch.linalg.cross(direction, x), direction])
     return rigid(rotation, -rotation @ center)

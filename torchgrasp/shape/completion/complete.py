@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import nearest
-from torchgrasp.foundation.base import Batch, Value, join
+from torchgrasp.foundation.base import Batch, Value, flatnonzero, join
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial
@@ -201,7 +201,7 @@ def complete_cloud(
 
     ball = find_ellipsoid(scorer.points, scorer.normals, outline, table)
     if ball is not None:
-        rows = torch.nonzero(_hidden(scorer, ball.points))[:, 0]
+        rows = flatnonzero(_hidden(scorer, ball.points))
         rows = rows[pick_apart(ball.points[rows], budget)]
         points = ball.points[rows]
         return dataclasses.replace(
@@ -297,8 +297,8 @@ def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]
     if revolution is None:
         every = torch.arange(len(scorer.points), device="cpu")
         return [_Part(scorer, every, *find_planes(scorer))]
-    rows = torch.nonzero(revolution.body)[:, 0]
-    rest = torch.nonzero(~revolution.body)[:, 0]
+    rows = flatnonzero(revolution.body)
+    rest = flatnonzero(~revolution.body)
     body = scorer.for_part(rows)
     parts = [_Part(body, rows, *find_planes(body, turned=True))]
     if len(rest) >= HIDDEN.attached:
@@ -382,7 +382,7 @@ def _back_of_bars(scorer: SymmetryScorer, n_planes: int) -> _Image:
     near = nearest(points, BAR.neighbours)[1]
     across = -2 * scorer.outline.hull_distance(points)
     width = across[near].amax(1)
-    rows = torch.nonzero((across > BAR.middle * width) & (width < BAR.thin))[:, 0]
+    rows = flatnonzero((across > BAR.middle * width) & (width < BAR.thin))
     rows = rows[pick_apart(points[rows], 2 * SYMMETRY.probes)]
     at = points[rows]
     width = width[rows]
@@ -441,4 +441,4 @@ def _thin(points: Points) -> Int[Tensor, "k"]:
     for i in range(len(points)):
         if keep[i]:
             keep[i + 1 :] &= apart[i, i + 1 :]
-    return torch.nonzero(torch.from_numpy(keep))[:, 0]
+    return flatnonzero(torch.from_numpy(keep))

@@ -17,7 +17,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.geometry.linalg import Points, across, farthest_points, unit
+from torchgrasp.geometry.linalg import Points, across, farthest_points, norm, unit
 from torchgrasp.values.planning import PointCloud
 
 
@@ -167,7 +167,7 @@ class Silhouette(Value):
         limit = position.new_tensor(self.outside.shape).flip(0) - 1
         clamped = torch.minimum(position.clamp_min(0), limit)
         column, row = torch.round(clamped).long().unbind(-1)
-        beyond = torch.linalg.vector_norm(position - clamped, dim=-1) * self.cell
+        beyond = norm(position - clamped) * self.cell
         return self.outside[row, column] + beyond, self.depth[row, column], depth
 
 
@@ -374,7 +374,7 @@ def _check_view(points: Points, viewpoint: Float[Tensor, "3"]) -> None:
     depth = depth[:, None]
     deeper = depth - depth[torch.from_numpy(index), 0] - torch.from_numpy(apart) * depth  # (n, k)
     points = points.double().cpu()
-    radius = torch.linalg.vector_norm(points - find_middle(points), dim=-1).max()
+    radius = norm(points - find_middle(points)).max()
     share = float((deeper.amax(1) > BEHIND.radius * radius).double().mean())
     if share > BEHIND.share:
         found = f"{share:.0%} of the points behind others, which no camera sees at once"

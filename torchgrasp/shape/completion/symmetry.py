@@ -20,6 +20,7 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import (
     Points,
     fibonacci_sphere,
+    norm,
     reflect,
     reflect_directions,
     unit,
@@ -246,7 +247,7 @@ def find_planes(
         directions = fibonacci_sphere(SEARCH.sphere)[: SEARCH.sphere // 2]
     # From above, or from sides that are far apart, no side alone is hidden, and every plane may add
     # points.
-    across = unit(view) if float(torch.linalg.vector_norm(view)) > SEARCH.one_side else None
+    across = unit(view) if float(norm(view)) > SEARCH.one_side else None
     grid = _plane_grid(scorer, directions)  # (d, k, 4)
     scores, _ = scorer.score(grid.reshape(-1, 4))
     scores = scores.reshape(grid.shape[:2])

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Batch, Value
 from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.linalg import Points, solve_least_squares, unit
+from torchgrasp.geometry.linalg import Points, norm, solve_least_squares, unit
 from torchgrasp.shape.completion.axis import fit_axis, rotations_about_z
 from torchgrasp.shape.completion.complete import HIDDEN, merge_hidden
 from torchgrasp.shape.completion.silhouette import Outlines, pick_apart
@@ -132,7 +132,7 @@ def find_vessel(
     normal's horizontal part. Robust weights (Cauchy) ignore handles.
     """
     height = points[:, 2]
-    slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
+    slope = norm(normals[:, :2])
     level = normals[:, :2] / slope[:, None].clamp_min(numbers.least_slope)
     steep = slope > numbers.level
     middle = height.mean()
@@ -147,7 +147,7 @@ def find_vessel(
     facing = miss
     for k in range(numbers.rounds):
         arm = points[:, :2] - center
-        radius = torch.linalg.vector_norm(arm, dim=1)
+        radius = norm(arm)
         out = unit(arm)
         facing = (out * level).sum(1)
         wall = below & steep & (facing.abs() > numbers.level)
@@ -250,7 +250,7 @@ def complete_walls(
         floor = float(points[seen_floor, 2].median())
     else:
         floor = table + vessel.thickness
-        away = torch.linalg.vector_norm(points[inner, :2] - vessel.center, dim=1)
+        away = norm(points[inner, :2] - vessel.center)
         inner_parts.append(_disc(vessel, floor, float(away.min()), numbers.floor_rings))
     outer_hidden = _merge(points[~inner], outline, outer_parts, vessel, table)
     inner_hidden = _merge(points[inner], outline, inner_parts, vessel, floor)
