@@ -101,7 +101,8 @@ def plan_edge_grasps(
 
     Raises:
         BadArgument: a table without an edge, or one whose edge is more than 15 mm (`DRAG.behind`)
-            behind the object's estimated centre of mass: the object would fall.
+            behind the object's estimated centre of mass: the object would fall. Also one whose edge
+            is more than 2 m (`DRAG.farthest`) from it: its numbers are not metres.
         BadArgument: a friction of the fingertips that is not greater than `table_friction`.
 
     >>> import torch
@@ -120,6 +121,9 @@ def plan_edge_grasps(
     if balance.away < -DRAG.behind:
         found = f"an edge {-1e3 * balance.away:.0f} mm behind the object's centre"
         raise BadArgument("spec.table", found, "an edge beyond it")
+    if balance.away > DRAG.farthest:
+        found = f"an edge {balance.away:.4g} m from the object's centre"
+        raise BadArgument("spec.table", found, f"one within {DRAG.farthest:g} m, in metres")
     mass = Distribution.of(request.grasp_task.mass).most
     load = _weight(mass, table, apply(frame, balance.centre[None])[0])
     request = dataclasses.replace(request, resist=load)
