@@ -17,6 +17,7 @@ from torchgrasp import load_grasps, load_hand, load_object, plan_grasps
 from torchgrasp.app.cli import evaluate as evaluate_command
 from torchgrasp.app.cli import grasp as grasp_command
 from torchgrasp.app.cli import hands as hand_commands
+from torchgrasp.app.cli import results
 from torchgrasp.app.report import page
 from torchgrasp.data.shards import JobRow, Shard, pack_shard
 from torchgrasp.data.shipped import DATA
@@ -84,7 +85,7 @@ def grasp(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     surface = extract_surface(
         next(value for stage, _, value in told if stage == "shape"), resolution=16
     )
-    monkeypatch.setattr(grasp_command, "extract_surface", lambda shape: surface)
+    monkeypatch.setattr(results, "extract_surface", lambda shape: surface)
     monkeypatch.setattr(page, "draw_pictures", lambda run: {})
     view = str(DATA / "cylinder" / "view.ply")
     return lambda out: [
