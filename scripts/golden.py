@@ -176,7 +176,8 @@ def run_command(words: str) -> str:
         text = stdout.getvalue()
     for folder, name in ((DATA, "DATA"), (hands_folder(), "HANDS"), (out, "OUT")):
         text = text.replace(str(folder), name)
-    return digest(re.sub(r"[0-9.]+ (s|min)\b", "TIME", text), str(code))
+    # times are padded to a width
+    return digest(re.sub(r" *[0-9.]+ (s|min)\b", " TIME", text), str(code))
 
 
 JOBS: dict[str, tuple[Callable[..., str], list[tuple[Any, ...]]]] = {
