@@ -24,14 +24,15 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
 OBJECTS = ("cylinder", "jug", "rabbit", "spray")
 HANDS = ("allegro", "barrett")
-MODES = ("joint", "contact_first", "paper")
+Mode = Literal["joint", "contact_first", "paper"]
+MODES: tuple[Mode, ...] = ("joint", "contact_first", "paper")
 VIEWS = tuple((name, k) for name in OBJECTS for k in range(6))
 """View 0 is the shipped one; the others look from azimuths of 60 degrees apart."""
 STARTS = {"joint": 80, "contact_first": 30, "paper": 10}
@@ -109,13 +110,13 @@ def see(name: str, k: int) -> Any:
     return cloud_from_depth(depth, INTRINSICS, mask=labels == 1, camera_pose=pose)
 
 
-def plan(name: str, k: int, hand: str, mode: Any) -> str:
+def plan(name: str, k: int, hand: str, mode: Mode) -> str:
     """Return the hash of the grasps that are planned on a view."""
     from torchgrasp import ContactSpec, load_hand, plan_grasps
 
     spec = (ContactSpec.paper if mode == "paper" else ContactSpec)(table=0.0)
-    asked = (see(name, k), load_hand(hand), spec, STARTS[mode], 0)
-    return hash_grasps(plan_grasps(*asked, mode=mode))
+    grasps = plan_grasps(see(name, k), load_hand(hand), spec, STARTS[mode], 0, mode=mode)
+    return hash_grasps(grasps)
 
 
 def close(name: str, hand: str, how: str) -> str:
@@ -130,12 +131,15 @@ def close(name: str, hand: str, how: str) -> str:
     if "sensor" in options:
         options["sensor"] = SensorModel(options["sensor"])
     thing = load_object(name)
-    known: dict[str, Any] = {"parts": thing.parts, "surface": None}
+    surface = None
     if options.pop("seen", False):
-        known["surface"] = surface_field(fit_shape(thing.view, table=0.0))
+        surface = surface_field(fit_shape(thing.view, table=0.0))
     spec = TrialSpec(lift_height=0.02, hold_time=0.1, **options)
     grasp = load_shipped_grasp(name, hand)
-    found = close_hand(grasp, load_hand(hand), thing.mesh, spec, error=error, **known)
+    model = load_hand(hand)
+    found = close_hand(
+        grasp, model, thing.mesh, spec, error=error, parts=thing.parts, surface=surface
+    )
     moved = (found.object_pose, found.hand_pose, found.joints)
     return digest(found.status.name, found.time, found.forces, *moved)
 
@@ -182,7 +186,10 @@ def run_command(words: str) -> str:
 
 JOBS: dict[str, tuple[Callable[..., str], list[tuple[Any, ...]]]] = {
     "plan": (plan, [(*view, hand, mode) for view in VIEWS for hand in HANDS for mode in MODES]),
-    "close": (close, [(x, hand, how) for how in CLOSINGS for x in OBJECTS[:2] for hand in HANDS]),
+    "close": (
+        close,
+        [(name, hand, how) for how in CLOSINGS for name in OBJECTS[:2] for hand in HANDS],
+    ),
     "lift": (lift, [(k,) for k in range(8)]),
     "export": (export, [(name, hand) for name in OBJECTS[:2] for hand in HANDS]),
     "command": (run_command, [(words,) for words in COMMANDS]),
@@ -213,13 +220,13 @@ def compute_all(parts: Iterable[str], every: int, workers: int) -> dict[str, str
 
 def main() -> int:
     """Save hashes, or compare them."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    add = parser.add_argument
-    add("--save", type=Path, help="file that the hashes are written to")
-    add("--against", type=Path, help="file of hashes to compare with")
-    add("--only", nargs="+", choices=JOBS, default=list(JOBS), help="parts; by default all")
-    add("--every", type=int, default=1, help="compute only each so many-th hash of a part")
-    add("--workers", type=int, default=2, help="processes")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    add_option = parser.add_argument
+    add_option("--save", type=Path, help="file that the hashes are written to")
+    add_option("--against", type=Path, help="file of hashes to compare with")
+    add_option("--only", nargs="+", choices=JOBS, default=list(JOBS), help="parts; by default all")
+    add_option("--every", type=int, default=1, help="3 computes each third hash of a part")
+    add_option("--workers", type=int, default=2, help="processes")
     given = parser.parse_args()
     found = compute_all(given.only, given.every, given.workers)
     for name in sorted(name for name, value in found.items() if "Error" in value or ":" in value):

@@ -4,7 +4,7 @@ Python there is.
 
     python scripts/package.py                                 with all Pythons that are found
     python scripts/package.py --python python3.10 python3.13  with these; with none it only builds
-    python scripts/package.py --torch-index INDEX             torch from there, as PyTorch's own
+    python scripts/package.py --torch-index INDEX             with torch from this index
 
 Nothing but Python, its venv module and git is needed. Environments are made one at a time and
 removed.
@@ -32,13 +32,18 @@ JOB = "grasp cloud.ply --hand allegro --starts 200 --out mine"
 
 def main() -> int:
     """Build, check and try; the exit code is 0 if all is well."""
-    shown = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=shown)
-    add = parser.add_argument
-    folder = ROOT / "out/package"
-    add("--out", type=Path, default=folder, help="folder of wheel, sdist, package.json")
-    add("--python", nargs="*", help="interpreters; by default all of PATH and pyenv from 3.10 on")
-    add("--torch-index", help="index that torch is taken from; by default where pip looks")
+    as_written = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=as_written)
+    default = ROOT / "out/package"
+    parser.add_argument(
+        "--out", type=Path, default=default, help="folder of wheel, sdist, package.json"
+    )
+    parser.add_argument(
+        "--python", nargs="*", help="interpreters; by default all of PATH and pyenv from 3.10 on"
+    )
+    parser.add_argument(
+        "--torch-index", help="index that torch is taken from; by default where pip looks"
+    )
     asked = parser.parse_args()
     if run("git", "status", "--porcelain", cwd=ROOT).strip():
         print("package: what is not committed is left out")

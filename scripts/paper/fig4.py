@@ -62,14 +62,14 @@ def fig4(out: Path, seed: int = 0) -> None:
         scenes.append((thing, clouds, surfaces, arrows))
     # One scale for all, the most certain 80 % of each: the least certain bulges would leave all
     # else in one colour.
-    drawn = [surface for _, _, surfaces, _ in scenes for surface in surfaces]
-    most = 1e3 * max(float(surface.std_m.quantile(0.8)) for surface in drawn)
+    every = [surface for _, _, surfaces, _ in scenes for surface in surfaces]
+    most = 1e3 * max(float(surface.std_m.quantile(0.8)) for surface in every)
     columns = []
     for thing, clouds, surfaces, arrows in scenes:
         eye = rotated(view_of(thing.view), TURN)
         corners = np.asarray(thing.mesh.vertices)
-        shapes = list(zip(surfaces, arrows, strict=True))
-        column = ((clouds[0], None), shapes[0], (clouds[1], None), *shapes[1:])
+        of_whole, *of_views = zip(surfaces, arrows, strict=True)
+        column = ((clouds[0], None), of_whole, (clouds[1], None), *of_views)
         columns.append([draw(what, normals, most, corners, eye) for what, normals in column])
     titles = {(row, 0): title for row, title in enumerate(ROWS)}
     save_sheet(out / "fig4.png", list(zip(*columns, strict=True)), titles, most)

@@ -139,9 +139,10 @@ def fig5(out: Path, starts: int = 300, seed: int = 0) -> None:
             better = -contacts.variance.sum(1)
         shown = unlike(contacts[better >= better.median()], SHOWN)
         scenes.append((f"{name}, {setting}", extract_surface(shape, 64), shown))
-        most = 1e3 * shown.require_std().max()
+        least_certain = 1e3 * shown.require_std().max()
         text = f"{len(contacts):5} certified, closure probable to {likely.mean():.2f}"
-        print(f"{name:10}{setting:9}{text}, drawn with std [mm] up to {most:.1f}", flush=True)
+        text += f", drawn with std [mm] up to {least_certain:.1f}"
+        print(f"{name:10}{setting:9}{text}", flush=True)
     most = 1e3 * max(float(surface.std_m.quantile(0.9)) for _, surface, _ in scenes)
     rows = [[draw(surface, shown[k], most) for _, surface, shown in scenes] for k in range(SHOWN)]
     captions = {(0, column): name for column, (name, *_) in enumerate(scenes)}

@@ -182,8 +182,9 @@ class _Bench:
         """Plan on a view of an object that stands on a table at z = 0."""
         cloud = self.solid.views[view]
         asked = ContactSpec(max_variance=row.variance, table=0.0)
-        given = (self.hand, asked, self.spec.starts, self.spec.seed)
-        grasps = plan_grasps(cloud, *given, shape=self.shape(view, row.support))
+        shape = self.shape(view, row.support)
+        starts = self.spec.starts
+        grasps = plan_grasps(cloud, self.hand, asked, starts, self.spec.seed, shape=shape)
         return grasps[grasps.status == Status.OK]
 
     def shape(self, view: str, support: Support) -> ShapeGP:
@@ -199,8 +200,9 @@ class _Bench:
         mesh, parts, mass, _ = self.solid
         mass = mass if self.subject.folder is None else MASS
         seed = seed_of(self.spec.seed, self.subject.label, view, rank, draw)
-        law = {"closing": row.closing, "holding": row.holding}
-        trial = dataclasses.replace(PAPER.trial, mass=mass, **law)
+        trial = dataclasses.replace(
+            PAPER.trial, closing=row.closing, holding=row.holding, mass=mass
+        )
         error = draw_error(PAPER, grasp, mesh, seed)
         touch = seed_of(seed, "touch")
         found = close_hand(grasp, self.hand, mesh, trial, touch, parts=parts, error=error)

@@ -220,10 +220,11 @@ def path(
     up = np.asarray(normal, float) / np.linalg.norm(normal)
     out = np.cross(along / np.linalg.norm(along, axis=1, keepdims=True), up)
     section = disc(1.0, 1.0, 0.0, sides) * (math.sqrt(2) if sides == 4 else 1.0)
-    sizes = (thick, thick if wide is None else wide)
-    deep, broad = (np.broadcast_to(x, len(points))[:, None, None] for x in sizes)
-    inward = deep * section[:, :1] * out[:, None]
-    rings = points[:, None] + inward - broad * section[:, 1:2] * up
+    halves = (thick, thick if wide is None else wide)
+    # (n, 1, 1)
+    in_plane, beside = (np.broadcast_to(half, len(points))[:, None, None] for half in halves)
+    outward = in_plane * section[:, :1] * out[:, None]
+    rings = points[:, None] + outward - beside * section[:, 1:2] * up
     pairs = itertools.pairwise([*rings, rings[0]] if closed else rings)
     return [Solid(_sew(rings, closed), [np.concatenate(pair) for pair in pairs])]
 
@@ -242,7 +243,9 @@ def arc(
 def move(thing: Thing, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Thing:
     """Return the thing, moved."""
     by = np.array([x, y, z])
-    return [Solid(body.translate((x, y, z)), [p + by for p in pieces]) for body, pieces in thing]
+    return [
+        Solid(body.translate((x, y, z)), [piece + by for piece in pieces]) for body, pieces in thing
+    ]
 
 
 def turn(thing: Thing, axis: str, degrees: float) -> Thing:
@@ -252,7 +255,10 @@ def turn(thing: Thing, axis: str, degrees: float) -> Thing:
     matrix = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     matrix = np.round(matrix) if degrees % 90 == 0 else matrix
     pose = np.c_[matrix, np.zeros(3)]
-    return [Solid(body.transform(pose), [p @ matrix.T for p in pieces]) for body, pieces in thing]
+    return [
+        Solid(body.transform(pose), [piece @ matrix.T for piece in pieces])
+        for body, pieces in thing
+    ]
 
 
 def lie(thing: Thing) -> Thing:

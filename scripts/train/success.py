@@ -163,8 +163,8 @@ def fit_model(trials: Trials, left: Array) -> SuccessModel:
     """Return the model, without promises; the mask `left` tells which trials calibrate it and fit
     no tree.
     """
-    ways = [directions().get(name, 0) for name in FEATURES]
-    trees = HistGradientBoostingClassifier(**TREES, monotonic_cst=ways)
+    monotonic = [directions().get(name, 0) for name in FEATURES]
+    trees = HistGradientBoostingClassifier(**TREES, monotonic_cst=monotonic)
     trees.fit(trials.features[~left], trials.passed[~left])
     others = trials.select(left)
     fitted = read_trees(trees)

@@ -199,8 +199,15 @@ def run_trials(
     spread = f"{BEST} of its twenty best grasps and {SPREAD} others"
     which = f"the best grasps for {TASKS} ordinary tasks" if best else spread
     tried = "household bodies" if shelf is None else "given objects"
-    told = {"bodies": tried, "versions": json.dumps(versions()), "starts": STARTS, "which": which}
-    write_file(folder / hand / README, ABOUT.format(hand=hand, counts=counts, **told))
+    about = ABOUT.format(
+        hand=hand,
+        bodies=tried,
+        counts=counts,
+        versions=json.dumps(versions()),
+        starts=STARTS,
+        which=which,
+    )
+    write_file(folder / hand / README, about)
     return data
 
 

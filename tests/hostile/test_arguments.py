@@ -105,7 +105,9 @@ def test_values_are_moved_or_name_what_is_wrong(kind, tmp_path):
 
 
 EACH = 2
-"""Every so many-th wrong argument is given in a short run, from another first one to each call."""
+"""A short run gives a call each second wrong argument: one call from the first on, the next from the
+second on.
+"""
 
 
 @pytest.mark.promise("I1")
@@ -159,7 +161,8 @@ def dual(function, x):
 )
 def test_transformed_tensors_are_refused_where_nothing_is_differentiable(transform, found):
     def margin(points):
-        return torchgrasp.closure_probability(shape, torchgrasp.Contacts(points, points)).sum()
+        contacts = torchgrasp.Contacts(points, points)
+        return torchgrasp.closure_probability(shape, contacts).probability.sum()
 
     shape = torchgrasp.fit_shape(torchgrasp.load_object("jug").view)
     with pytest.raises(BadArgument, match=f"contacts.points: .*{found}"):

@@ -65,8 +65,15 @@ class Cell(NamedTuple):
 
 def table_spec(o: Options, representatives: bool) -> TableSpec:
     """Return the campaign that some options ask for, of one object of each family or of all."""
-    which = {"only": o.names, "own": False, "representatives": representatives}
-    return TableSpec(o.out, o.objects, **which, starts=o.starts, seed=o.seed)
+    return TableSpec(
+        o.out,
+        o.objects,
+        only=o.names,
+        own=False,
+        representatives=representatives,
+        starts=o.starts,
+        seed=o.seed,
+    )
 
 
 @bench("close/success", objects=True)

@@ -276,9 +276,9 @@ def lift_target(
     if best is None or best.grasps is None:
         reasons = "; ".join(dict.fromkeys(x.reason for x in plan.things if x.reason))
         return dataclasses.replace(told, said=reasons, clear=len(plan.clear))
-    target, *around = map(Neighbour, clutter.meshes, clutter.parts)
+    own, *around = map(Neighbour, clutter.meshes, clutter.parts)
     table = Plane.horizontal(0.0)
-    truth = Truth(target.mesh, target.parts, table=table, neighbours=around)
+    truth = Truth(own.mesh, own.parts, table=table, neighbours=around)
     closed = lift_grasp(GraspTrial(load_hand(hand), best.grasps[0], truth, seed), trial)
     assert closed.disturbance is not None
     return dataclasses.replace(
