@@ -65,8 +65,8 @@ def check_agreement(
     slack: float,
     share: float,
 ) -> float:
-    """Return the median distance [m] of points from a mesh, or from a cloud and the space hidden
-    behind it; raise `BadArgument` if they lie off it.
+    """Return the median distance [m] of points from a mesh, or from a cloud and the space behind
+    it; raise `BadArgument` if they lie off it.
 
     At most the fraction `share` of the `points` (n, 3) [m] may be farther than `slack` [m] from
     `other`, the mesh [m] or the cloud. Errors call the argument `name`, and its points `what`.
@@ -93,8 +93,9 @@ def check_agreement(
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
     """Raise `BadArgument` if many points of an object's cloud do not lie on the object's mesh.
 
-    The mesh [m] is in the frame of the cloud. Errors call it by `name`. A mesh that is farther from
-    most points than noise explains, as that of a similar object, raises the warning `CloudWarning`.
+    The mesh [m] is in the frame of the cloud. Errors call it by `name`. The warning
+    `CloudWarning` tells that most points are farther from it than noise explains, as from the mesh
+    of a similar object.
     """
     noise = noise_of(cloud)
     slack = AGREEMENT.slack + 2 * noise
