@@ -156,6 +156,10 @@ class LayerNumbers:
     """Least share of all points in the layer."""
     own: float = 0.25
     """Greatest share of points on the table, over the share of the layer."""
+    standing: float = 0.01
+    """Least share of points that are higher than a layer above the table: over the flat top of an
+    object there are none.
+    """
 
 
 LAYER = LayerNumbers()
@@ -449,6 +453,9 @@ def tell_layer(points: Points, plane: Plane) -> tuple[str, ...]:
     share = float((height - middle).abs().le(LAYER.half).double().mean())
     on = float(height.abs().le(LAYER.half).double().mean())
     if abs(middle) < LAYER.beside or share < LAYER.share or on > LAYER.own * share:
+        return ()
+    higher = float((height > middle + LAYER.beside).double().mean())
+    if middle > 0 and higher < LAYER.standing:
         return ()
     side = "below" if middle > 0 else "above"
     found = f"the given table is {1e3 * abs(middle):.0f} mm {side} {share:.0%} of the points"
