@@ -1,5 +1,6 @@
 """Inputs about one object that contradict each other are told, and right twins pass."""
 
+import dataclasses
 import functools
 
 import pytest
@@ -153,3 +154,11 @@ def test_a_similar_mesh_is_told():
     similar = trimesh.creation.box((0.071, 0.069, 0.126)).apply_translation((0.0, 0.0, 0.063))
     with pytest.warns(CloudWarning, match=r"--mesh: half of the cloud's points are over \d mm off"):
         check_mesh(view(), similar, "--mesh")
+
+
+def test_a_known_error_of_the_cameras_pose_is_no_other_mesh():
+    shifted = moved(BOX, 0.004, 0.004, 0.004)
+    with pytest.warns(CloudWarning, match="mesh of this object"):
+        check_mesh(view(), shifted)
+    error = torch.full_like(view().points[:, 0], 0.005)
+    check_mesh(dataclasses.replace(view(), pose_error=error), shifted)

@@ -152,6 +152,11 @@ TOLD = {
         ",x,y,z\n" + rows(COLOURED[:, [3, 0, 1, 2]], ","),
         "4 columns with the names 'x y z'",
     ),
+    # with a column more, the first would be taken for x
+    "index.csv": (
+        ",0,1\n" + "".join(f"{k},{x:f},{y:f}\n" for k, (x, y, _) in enumerate(POINTS)),
+        "line 2, .*, where 2 numbers",
+    ),
     "null.csv": (
         "x,y,z\n" + rows(POINTS, ",") + "null,0.1,0.2\n",
         "line 62, 'null,0.1,0.2', where 3 numbers",

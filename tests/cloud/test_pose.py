@@ -346,6 +346,14 @@ def test_a_given_table_beside_the_layer_of_the_points_is_told(view, off):
     assert abs(float(re.findall(r"is it at (\S+) m", note)[0])) < 0.002
 
 
+def test_the_top_of_an_object_that_was_cut_out_is_no_table():
+    pose = look_at(20.0, 70.0, 0.5)
+    depth, labels = map(halved, render_depth([box((0.12, 0.08, 0.06))], pose))
+    inside = labels == 1
+    cut = depth * inside
+    assert Scene.from_depth(cut, HALF, pose, mask=inside, table=0.0).notes == ()
+
+
 def test_a_tilt_by_a_wrong_focal_length_is_told():
     depth, pose = seen()
     wrong = HALF * torch.tensor([[1.4], [1.4], [1.0]]).double()

@@ -13,6 +13,7 @@ from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.creases import cut_creases
+from torchgrasp.scene.image import RAYS, DepthImage, tell_rays
 from torchgrasp.values.planning import PointCloud
 
 POSE = look_at(20.0, 45.0, 0.6)
@@ -330,3 +331,12 @@ def test_distances_along_rays_are_told(elevation):
         except NoSupport as error:
             told = (str(error),)
         assert any("distance along the ray of each pixel" in note for note in told)
+
+
+def test_few_pixels_tell_nothing_of_rays():
+    pose = look_at(20.0, 35.0, 0.6)
+    depth, _ = render_depth(things(), pose)
+    few = torch.zeros_like(depth)
+    few[::80, ::80] = depth[::80, ::80]
+    assert 0 < int((few > 0).sum()) < 16 * RAYS.fewest
+    assert tell_rays(DepthImage(few, K, pose)) == ()

@@ -34,7 +34,8 @@ class AgreementNumbers:
     """Greatest share of points that may be farther from their mesh."""
     beside: float = 0.0005
     """Greatest median distance [m] of points from their mesh without a warning, in addition to the
-    noise. Views of rendered sensors are nearer to their mesh, those of a similar object farther.
+    noise and the error of the camera's pose. Views of rendered sensors are nearer to their mesh,
+    those of a similar object farther.
     """
     guessed: float = 0.4
     """Greatest share of contacts that may be farther from their mesh: one of three, on a side that
@@ -65,8 +66,8 @@ def check_agreement(
     slack: float,
     share: float,
 ) -> float:
-    """Return the median distance [m] of points from a mesh, or from a cloud and the space hidden
-    behind it; raise `BadArgument` if they lie off it.
+    """Return the median distance [m] of points from a mesh, or from a cloud and the space behind
+    it; raise `BadArgument` if they lie off it.
 
     At most the fraction `share` of the `points` (n, 3) [m] may be farther than `slack` [m] from
     `other`, the mesh [m] or the cloud. Errors call the argument `name`, and its points `what`.
@@ -93,14 +94,16 @@ def check_agreement(
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
     """Raise `BadArgument` if many points of an object's cloud do not lie on the object's mesh.
 
-    The mesh [m] is in the frame of the cloud. Errors call it by `name`. A mesh that is farther from
-    most points than noise explains, as that of a similar object, raises the warning `CloudWarning`.
+    The mesh [m] is in the frame of the cloud. Errors call it by `name`. The warning
+    `CloudWarning` tells that most points are farther from it than noise and pose error explain, as
+    from the mesh of a similar object.
     """
     noise = noise_of(cloud)
     slack = AGREEMENT.slack + 2 * noise
     points = cloud.points
     off = check_agreement(name, points, "the cloud's points", mesh, slack, AGREEMENT.share)
-    if off > AGREEMENT.beside + noise:
+    error = 0.0 if cloud.pose_error is None else float(cloud.pose_error.median())
+    if off > AGREEMENT.beside + noise + error:
         found = f"half of the cloud's points are over {1e3 * off:.0f} mm off it"
         warn_user(CloudWarning, f"{name}: {found}: is it the mesh of this object, at its place?")
 

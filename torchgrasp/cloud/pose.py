@@ -52,7 +52,9 @@ class PoseNumbers:
     farthest: float = 100.0
     """A camera farther from the origin [m] has a pose that is not in metres."""
     farthest_table: float = 10.0
-    """A table farther from the origin along its normal [m] has a pose that is not in metres."""
+    """A table farther from the origin along its normal [m] has a pose that is not in metres. Of a
+    camera so far off, a warning tells.
+    """
     millimetres: float = 200.0
     """A position that is too far is in mm if a coordinate is above this, else in cm."""
     shallow: float = 0.15
@@ -75,9 +77,11 @@ class PoseNumbers:
     """Another pose is suggested if with it the table tilts by less than this [deg]. It must also
     tilt less than a third as much as now.
     """
+    told: float = 5.0
+    """Tilt of a table [deg] from which a note tells it."""
     upturned: float = 0.5
-    """Least part along y of a table's normal in the camera's own frame, whose y points down, from
-    which the camera hangs upside down.
+    """Part of a table's normal along y of the camera's own frame, which points down. Above this,
+    the camera hangs upside down.
     """
     sloped: float = 15.0
     """A table tilted by less than this [deg], or as far from upside down, may be a slope."""
@@ -141,8 +145,8 @@ class LayerNumbers:
     half: float = 0.005
     """Half the thickness of the layer [m]: the noise of a near depth camera."""
     beside: float = 0.008
-    """Least distance [m] of the layer from the table: objects lose their lowest points to a table
-    that is given too high, and rise from one that is given too low.
+    """Least distance [m] of the layer from the table. Objects lose their lowest points to a table
+    that is too high, and rise from one that is too low.
     """
     above: float = 0.1
     """Greatest height [m] of the table above the layer: a floor is farther below a table."""
@@ -152,6 +156,10 @@ class LayerNumbers:
     """Least share of all points in the layer."""
     own: float = 0.25
     """Greatest share of points on the table, over the share of the layer."""
+    standing: float = 0.01
+    """Least share of points that are higher than a layer above the table: over the flat top of an
+    object there are none.
+    """
 
 
 LAYER = LayerNumbers()
@@ -215,8 +223,9 @@ def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
 
 
 def tell_far(pose: Transform) -> tuple[str, ...]:
-    """Return one note if a camera is so far from its frame's origin that its pose may be in cm, else
-    none.
+    """Return one note if a camera is very far from its frame's origin, else none.
+
+    Its pose may then be in cm.
     """
     distance = float(torch.linalg.vector_norm(pose[:3, 3]))
     if distance <= POSE.farthest_table:
@@ -394,8 +403,8 @@ def _check_normals(supports: tuple[SupportPlane, ...], pose: Transform, up: obje
 def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
     """Return one note if a table is tilted from z of the frame to which `pose` leads, else none.
 
-    A camera's own frame has no such z: there, a note tells of a table above the camera's middle.
-    `plane` is the table in that frame.
+    A camera's own frame has no such z. There, a note tells of a camera that hangs upside down.
+    `plane` is the table in the frame.
     """
     if _is_own(pose):
         if float(plane.normal[1]) <= POSE.upturned:
@@ -406,7 +415,7 @@ def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
         )
     cosine = float(plane.normal[2])
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
-    if tilt < POSE.level:
+    if tilt < POSE.told:
         return ()
     wrong = "a wrong camera_pose or focal length, or depth that is no distance, such as a z-buffer"
     fixes = f"if z is up, {wrong}, tilts it; if not, give up"
@@ -428,10 +437,9 @@ def _check_given_table(points: Points, plane: Plane) -> None:
 
 
 def tell_layer(points: Points, plane: Plane) -> tuple[str, ...]:
-    """Return one note if a given table is beside a layer of many points that is parallel to it,
-    else none.
+    """Return one note if many points lie in a layer that is parallel to a given table, else none.
 
-    The layer is perhaps the table. `points` (n, 3) [m] and the `plane` are in one frame.
+    The layer is perhaps the true table. `points` (n, 3) [m] and the `plane` are in one frame.
     """
     height = plane.height(points[:: 1 + len(points) // POSE.drawn].double().cpu())
     near = height[(height > -LAYER.above) & (height < LAYER.below)]
@@ -445,6 +453,9 @@ def tell_layer(points: Points, plane: Plane) -> tuple[str, ...]:
     share = float((height - middle).abs().le(LAYER.half).double().mean())
     on = float(height.abs().le(LAYER.half).double().mean())
     if abs(middle) < LAYER.beside or share < LAYER.share or on > LAYER.own * share:
+        return ()
+    higher = float((height > middle + LAYER.beside).double().mean())
+    if middle > 0 and higher < LAYER.standing:
         return ()
     side = "below" if middle > 0 else "above"
     found = f"the given table is {1e3 * abs(middle):.0f} mm {side} {share:.0%} of the points"

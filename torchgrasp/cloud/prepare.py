@@ -24,7 +24,7 @@ from torchgrasp.geometry.linalg import Points, Vector, unit, unit_of_any
 from torchgrasp.values.planning import PointCloud
 
 FACING = 0.9  # least share of a view's normals that face the camera; noise turns some at the rim
-INWARD = "to the middle of the points: if they are those of an object, give outward ones, or none"
+INWARD = "to the middle of the points: give outward ones, or none, unless only a hollow is seen"
 MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time of the selection
 
 
@@ -61,8 +61,8 @@ class NormalNumbers:
     rounded: float = 1e-3
     """Greatest error of a unit length: text files round to three digits."""
     inward: float = 0.05
-    """Least mean cosine, weighted with the distance from the middle, between normals and the way to
-    the middle, from which normals point inward: those of a flat view have none.
+    """Mean cosine between normals and the way to the middle, weighted with its length. Above this,
+    normals point inward; in a flat view it is 0.
     """
 
 
@@ -272,11 +272,11 @@ def compare_normals(points: Points, normals: Points) -> NormalCheck:
 
 
 def point_inward(points: Points, normals: Points) -> bool:
-    """Return whether normals (n, 3) point to the middle of their `points` (n, 3) [m], as those of a
-    surface that is inside out.
+    """Return whether normals (n, 3) point to the middle of their `points` (n, 3) [m].
 
-    For normals that point outward, the sum of (p - c) . n is that of the divergence theorem: three
-    times the volume of a closed surface, and positive for a view of a surface that bulges.
+    Then the surface is inside out, or hollow. For outward normals, the sum of (p - c) . n is that
+    of the divergence theorem. It is three times the volume of a closed surface, and positive for a
+    view of a surface that bulges.
     """
     away = points - points.mean(0)
     outward = float((away * unit_of_any(normals)).sum())

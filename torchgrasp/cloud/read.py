@@ -53,6 +53,8 @@ class ReadNumbers:
     """Least median cosine between normals and planes fitted to points: others are colours."""
     alike: float = 0.999
     """Least cosine of nearly all normals with their median if they are alike, as one colour is."""
+    across: float = 0.1
+    """Quantile of the cosines with fitted planes that must be as large if all normals are alike."""
     ahead: float = 0.6
     """A camera in the origin looks along z if the cosine to the middle of the points is above this;
     else z is up.
@@ -67,8 +69,6 @@ class ReadNumbers:
     """Quantile of the rows at a place that counts as usual: clouds may hold copies of points."""
     more: float = 5.0
     """Least number of rows at such a place, over the usual one."""
-    across: float = 0.1
-    """Quantile of the cosines with fitted planes that must be as large if all normals are alike."""
 
 
 READ = ReadNumbers()
@@ -116,7 +116,7 @@ def read_cloud(
       it is closed.
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z. VIEWPOINT
       gives the camera. Its default `0 0 0 1 0 0 0` counts only if a camera there can have seen the
-      points.
+      points. It does not count below all of them, where a robot's base is.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `table` (4,),
       `frustum` (4, 3), `pose_error` (n,). For several views: `viewpoint` (n, 3) and `frustum` (n,
       4, 3). Other arrays are not read; a note names them.
@@ -126,7 +126,8 @@ def read_cloud(
       text. A first line may name the columns (x y z nx ny nz), or hold the number of points.
 
     Arrays may also be images (h, w, 3) of points. Points with NaN or infinity are left out. Points
-    at (0, 0, 0) are left out if there are several. Points whose normal is NaN or zero are left out.
+    at (0, 0, 0) are left out if there are several, and so are many at any other one place. Points
+    whose normal is NaN or zero are left out.
     If most normals are NaN or zero, all normals are left out instead.
 
     Args:
@@ -440,10 +441,11 @@ def _find_measured(
 
 
 def _find_repeated(points: Tensor, keep: Tensor, notes: list[str]) -> Tensor:
-    """Return a mask of the rows at one place that holds far more of the rows `keep` than any other,
-    and add a note on them.
+    """Return a mask of the rows at one place, if it holds far more rows than other places do; add a
+    note on them.
 
-    They are missing pixels: those at (0, 0, 0), moved with the other points, or at (-1, -1, -1).
+    Only the rows of the mask `keep` count. Those at one place are missing pixels: (0, 0, 0), moved
+    with the other points, or (-1, -1, -1).
     """
     none = torch.zeros_like(keep)
     rows = torch.nonzero(keep)[:, 0]

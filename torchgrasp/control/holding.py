@@ -326,8 +326,7 @@ class GripHold:
         They are the `wanted` forces (f, 3) [N] plus a correction. It is the integrated difference
         between wanted and sensed normal forces, without the part that would move the object. Of the
         load, they carry only the share `GRIP.carries` of `LoadEstimate.carried`, so new load is
-        taken up slowly.
-        `contacts` is the grasp map of the fingertips.
+        taken up slowly. `contacts` is the grasp map of the fingertips.
         """
         if self.time > RAMP:
             lacking = ((self.felt - wanted) * self.normals).sum(-1)

@@ -424,7 +424,7 @@ def _tell_order(numbers: np.ndarray, quaternion: Quaternion, world: bool) -> Non
     still = np.abs(numbers[:, 3 if other == "wxyz" else 6]) > 1 - ROUNDING
     sides = {order: _one_side(numbers, order) for order in (quaternion, other)}
     one_sided = len(numbers) >= ORDER.grasps and sides[other] > ORDER.one_side
-    if world and still.all():
+    if world and len(still) and still.all():
         found = "half turns, and no turns"
     elif not world and one_sided and sides[quaternion] < ORDER.any_side:
         found = "hands with the object's origin on any side, and on one side"
@@ -435,8 +435,9 @@ def _tell_order(numbers: np.ndarray, quaternion: Quaternion, world: bool) -> Non
 
 
 def _one_side(numbers: np.ndarray, quaternion: Quaternion) -> float:
-    """Return how alike the direction of the origin is in the frames of hands, from 0 to 1, given
-    their poses (g, 7).
+    """Return how alike the direction of the origin is in the frames of hands, from 0 to 1.
+
+    `numbers` are their poses (g, 7).
     """
     away = numbers[:, :3] / np.linalg.norm(numbers[:, :3], axis=1, keepdims=True).clip(LEAST)
     inside = np.einsum("gij,gi->gj", _matrices(numbers, quaternion), away)

@@ -200,7 +200,7 @@ def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"
         if width > 1 and some[0].split() == [str(i) for i in range(width)]:
             # the numbers of columns without names, if the next line has fractions
             some.append(next(every, ""))
-            if "." in some[1]:
+            if "." in some[1] and len(some[1].split()) == width:
                 del some[0]
         if (
             not re.search(r"(?i)(?:^|\s)[-+.]*(?:\d|(?:nan|inf)\b)", some[0])

@@ -680,10 +680,10 @@ def _leans(view: SeenPoints, surface: _FlatSurface) -> float:
 
 
 def _is_wall(view: SeenPoints, surface: _FlatSurface, surfaces: list[_FlatSurface]) -> bool:
-    """Return whether a surface is level for a camera upside down alone, beside a larger one that is
-    level for an upright camera.
+    """Return whether a surface is level for a camera upside down alone, and may be a wall.
 
-    The larger one is at an angle to it, and as wide as furniture.
+    Beside a wall is a larger surface that is level for an upright camera. It is at an angle to the
+    wall, and as wide as furniture.
     """
     if _leans(view, surface) > -SUPPORTS.downward:
         return False

@@ -281,8 +281,8 @@ class _PressSearch:
         balance: where the weight of the object acts.
         top: the map of the object's top.
         force: sum of the normal forces [N] of the pressing tips.
-        lever: least ratio of the distance of two tips to that of the centre of mass from the line
-            of their drag.
+        lever: least ratio of the distance of two tips to that of the centre of mass from their
+            line of drag.
     """
 
     object_: ShapedObject
@@ -294,8 +294,8 @@ class _PressSearch:
     lever: float
 
     def place(self, tips: int, way: Float[Tensor, "3"]) -> tuple[int, Float[Tensor, "4 4"]] | None:
-        """Return the index of the best posture that presses with one or two `tips`, and its pose (4,
-        4) [m] on the object; None if no posture fits.
+        """Return the index of the best posture with one or two pressing `tips`, and its pose (4, 4)
+        [m] on the object; None if no posture fits.
 
         `way` [m] is the displacement of hand and object, in the upright frame.
         """

@@ -95,9 +95,9 @@ def step(
     """Try at most `tried` further contact sets of each object, and return three results.
 
     The first are all contact sets `rows` with the results. The others are the best grasps of those
-    that ended now, and the index of each grasp's object. `turn` is the number of the batch, from 1, and `last` says
-    whether it is the last one. In a mode other than "joint", `solve_all` solves for all sets, and
-    `rows` stay unchanged.
+    that ended now, and the index of each grasp's object. `turn` is the number of the batch, from 1,
+    and `last` says whether it is the last one. In a mode other than "joint", `solve_all` solves for
+    all sets, and `rows` stay unchanged.
     """
     if objects.request.mode != "joint":
         grasps = solve_all(objects, rows)

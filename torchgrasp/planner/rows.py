@@ -257,8 +257,8 @@ def find_candidates(
         plan: the planned contact sets.
         cloud: index of each planned set's object.
         most: largest number of sets that are chosen for each object.
-        note: function that is called after each of the stages "plan", "certify" and "query", with
-            the stage's name and result, such as `Report.note`.
+        note: function, such as `Report.note`, that is called with the name and the result of each
+            stage: "plan", "certify" and "query".
     """
     request = objects.request
     load = plan.contacts.points.new_zeros(len(plan), 6)
@@ -400,8 +400,8 @@ def choose(rows: Candidates, most: int, clouds: int) -> Int[Tensor, "k"]:
     """Return the indices of the next contact sets to try: at most `most` of each object.
 
     Farthest-point sampling chooses them among the untried sets of low cost. They are far from each
-    other, and from the sets that were tried before. `rows` are all contact sets, and `clouds` is the number of
-    objects. All objects are sampled at once, on their device.
+    other, and from the sets that were tried before. `rows` are all contact sets, and `clouds` is
+    the number of objects. All objects are sampled at once, on their device.
     """
     if not len(rows):
         return rows.cloud

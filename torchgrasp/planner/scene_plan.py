@@ -112,9 +112,9 @@ def plan_scene(
     first.
 
     Nothing is planned for an object whose image shows that it cannot be grasped
-    (`Status.FEW_PIXELS` to `TOO_WIDE`). The same holds for a shape that is `TOO_VAGUE`. Of the other
-    objects, near and tall ones with free space around them are planned first. Objects at the image
-    border, or too large for a prediction of success, are planned last.
+    (`Status.FEW_PIXELS` to `TOO_WIDE`). The same holds for a shape that is `TOO_VAGUE`. Of the
+    other objects, near and tall ones with free space around them are planned first. Objects at the
+    image border, or too large for a prediction of success, are planned last.
 
     With a `target`, only this object is planned. If it has no grasp, it is planned again without
     the nearest objects. `ScenePlan.clear` then says which of them to take away.

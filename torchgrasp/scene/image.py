@@ -199,8 +199,9 @@ def read_image(
 
 
 def tell_rays(image: DepthImage) -> tuple[str, ...]:
-    """Return one note if far more points would lie in one plane if the depths were the distances of
-    points from the camera, else none.
+    """Return one note if the depths are perhaps distances from the camera, else none.
+
+    As distances, they would put far more points into one plane.
     """
     k = image.intrinsics.double()
     row, column = torch.nonzero(image.depth > 0, as_tuple=True)
@@ -215,7 +216,8 @@ def tell_rays(image: DepthImage) -> tuple[str, ...]:
     nearer = seen / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
     height, width = image.depth.shape
     patch = row * RAYS.patches // height * RAYS.patches + column * RAYS.patches // width
-    if _share_flat(nearer, patch) < RAYS.better * _share_flat(seen, patch):
+    # of few points, neither share is known
+    if _share_flat(nearer, patch) <= RAYS.better * _share_flat(seen, patch):
         return ()
     found = "the support is flat if the depth is the distance along the ray of each pixel"
     fix = "the depth along the optical axis, distance / sqrt(1 + ((u-cx)/fx)^2 + ((v-cy)/fy)^2)"
@@ -223,8 +225,9 @@ def tell_rays(image: DepthImage) -> tuple[str, ...]:
 
 
 def _share_flat(points: Points, patch: Int[Tensor, "n"]) -> float:
-    """Return the greatest share of `points` (n, 3) [m] in one plane, which is fitted to a patch of
-    the image, then to all points near it.
+    """Return the greatest share of `points` (n, 3) [m] in one plane; 0 if no patch has enough.
+
+    A plane is fitted to each patch of the image, then to all points near it.
     """
     best = 0.0
     for one in patch.unique().tolist():

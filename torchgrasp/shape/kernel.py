@@ -275,9 +275,7 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
 
 def kernel_of(kernel: KernelName | Kernel, psi: float) -> Kernel:
-    """Return a kernel, given itself or by its name; the length of one by name follows from
-    `psi`.
-    """
+    """Return a kernel, given itself or by its name; `psi` is as in `kernel_by_name`."""
     return kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
 
 

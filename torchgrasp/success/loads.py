@@ -104,10 +104,10 @@ def carrying_force(
 def greatest_force(
     hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> Float[Tensor, "g"]:
-    """Return the largest factor (no unit) on the contact `forces` [N] at which no drive exceeds its
-    greatest torque, for each of g grasps.
+    """Return the largest factor (no unit) on the `forces` [N] of each of g grasps at which no drive
+    exceeds its greatest torque.
 
-    The forces are in the frame of the grasps. Those that are NaN give NaN.
+    The forces at the contacts are in the frame of the grasps. Those that are NaN give NaN.
     """
     jacobian, pushes, effort = _levers(hand, grasps, grasps.contacts, forces)
     torque = torch.einsum("gfih,gfi->gh", jacobian, pushes)

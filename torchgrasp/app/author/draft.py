@@ -519,7 +519,7 @@ def _toml_text(
 ) -> str:
     """Return the text of a hand.toml: `name` is that of the hand, `file` that of the URDF.
 
-    `pads` are given by tip, `options` by name, and `pairs` of links with the share with which each
+    `pads` are given by tip, and `options` by name. `pairs` of links have the share with which each
     is left out.
     """
     kp, kd = _gains(urdf)

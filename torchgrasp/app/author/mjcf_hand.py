@@ -426,8 +426,8 @@ class ModelHand:
         return drives
 
     def _leading_arms(self, tendon: int, mechanism: Mechanism) -> tuple[dict[str, float], float]:
-        """Return the length of a fixed tendon as a sum over leading joints, by name, and the part
-        that no joint changes.
+        """Return the arm of a fixed tendon on each leading joint by name, and the part of its
+        length that no joint changes.
         """
         arms = dict[str, float]()
         shift = 0.0

@@ -47,11 +47,11 @@ def make_run(
     task: GraspTask,
     **more: Any,
 ) -> Run:
-    """Return the run of a plan, with what lowers the success of its best executable grasp most, and
-    from where a second view would help.
+    """Return the run of a plan.
 
-    The first arguments are those of `Run`, and `more` are others by name. `shape` is the estimated
-    shape, and `task` that for which success is predicted.
+    It tells what lowers the success of the best executable grasp most, and from where a second view
+    would help. The first arguments are those of `Run`, and `more` are others by name. `shape` is
+    the estimated shape, and `task` that for which success is predicted.
     """
     hand = hand_of(grasps, hand)
     costs = [
@@ -67,8 +67,9 @@ def make_run(
 
 
 def write_run(out: Path, run: Run, pages: bool) -> list[Path]:
-    """Write the grasps of a run into a folder, the estimated surface if a grasp is executable, and
-    the `pages` for a person; return the paths.
+    """Write the grasps of a run into a folder, and the `pages` for a person; return the paths.
+
+    The estimated surface is written if a grasp is executable.
     """
     paths = [out / GRASPS]
     run.grasps.save(paths[0])
@@ -116,7 +117,7 @@ def describe_run(run: Run, out: Path) -> dict[str, Any]:
         "best": best,
         "drag": json.loads(run.grasps.meta.get(KEY, "null")),
         "look_next": None if run.look is None else describe_look(run.look),
-        "file": str(out / "grasps.safetensors"),
+        "file": str(out / GRASPS),
     }
 
 
