@@ -519,6 +519,8 @@ def test_a_mask_of_several_numbers_is_told():
     mask = torch.zeros(48, 64, dtype=torch.uint8)
     mask[5:20] = 255
     whole = cloud_from_depth(tilted_depth(), K, mask)
+    mask[19, ::3] = torch.arange(1, 23, dtype=torch.uint8)  # as at the border of a scaled mask
+    cloud_from_depth(tilted_depth(), K, mask)
     mask[10:20] = 128
     with pytest.warns(CloudWarning, match="mask: numbers from 128 to 255 count as one object"):
         assert len(cloud_from_depth(tilted_depth(), K, mask)) == len(whole)

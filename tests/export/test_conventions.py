@@ -404,3 +404,6 @@ def test_quaternions_of_the_other_order_are_told(tmp_path):
         read(rows, order, obj_pose=still)
         with pytest.warns(GraspFileWarning, match=f"half turns, and no turns as {order}"):
             read(rows[:4], other, obj_pose=still)
+        # hands in the world, whose origin is anywhere
+        far = row((np.array([0.0, 0.0, 5.0]), Rotation.from_rotvec([0.0, 0.3, 0.0])), [], other)
+        read(rows, other, obj_pose=far)

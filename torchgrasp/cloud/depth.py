@@ -52,6 +52,8 @@ class DepthNumbers:
     """Least share of pixels with the greatest depth, from which this depth, if too far, marks a
     background.
     """
+    several: float = 0.05
+    """Least share of a mask's pixels with one number that may be another object."""
     viewed: int = 5000
     """Number of points, about, by which a table in the view is compared with the pose."""
 
@@ -217,8 +219,10 @@ def read_depth(
     inside = pixels != 0
     if not bool(inside.any()):
         raise BadArgument("mask", "no pixel inside", "a mask that is not 0 at the object's pixels")
-    marks = pixels[inside]
-    if int(marks.max()) > int(marks.min()):
+    marks, count = pixels[inside].unique(return_counts=True)
+    # the border of a mask that was scaled has many numbers, each in few pixels
+    marks = marks[count >= DEPTH.several * count.sum()]
+    if len(marks) > 1:
         found = f"numbers from {int(marks.min())} to {int(marks.max())} count as one object"
         warn_user(CloudWarning, f"mask: {found}; if they are several, give mask == number")
     return metres, k, inside.to(image.device), lens

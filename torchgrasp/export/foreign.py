@@ -170,11 +170,13 @@ def read_foreign(
     dofs = _table(content["dofs"], len(columns))
     if len(pose) != len(dofs):
         raise _refuse(f"{path}: {len(pose)} poses, {len(dofs)} postures", "as many of either")
-    poses = _poses_of_file(pose, quaternion, unit_m)
+    poses = read_poses(pose, quaternion, unit_m)
     if "obj_pose" in content:
-        world = content["obj_pose"].numbers(POSE_NUMBERS, -FAR, FAR)
-        placed = _poses_of_file(np.array([world]), quaternion, unit_m, world=True)
-        poses = inverse(placed) @ poses
+        world = np.array([content["obj_pose"].numbers(POSE_NUMBERS, -FAR, FAR)])
+        _tell_turned_objects(world, quaternion)
+        poses = inverse(read_poses(world, quaternion, unit_m)) @ poses
+    else:
+        _tell_scattered_hands(pose, quaternion)
     joints = read_posture(hand, read_columns(hand, columns, dofs, _refuse), "grasp", _refuse)
     named = [content[name].text() for name in ROOTS if name in content]
     poses = poses @ _link_from_root(hand, joints, root if root != "" else "".join(named[:1]))
@@ -298,9 +300,12 @@ def _read_bench(
     joints = dict[str, Tensor]()
     for name, table in rows.items():
         pose = table[:, :POSE_NUMBERS]
-        poses[name] = _poses_of_file(pose, quaternion, unit_m, world=name == "obj_pose")
+        poses[name] = read_poses(pose, quaternion, unit_m)
         if name == "obj_pose":
+            _tell_turned_objects(pose, quaternion)
             continue
+        if "obj_pose" not in rows:
+            _tell_scattered_hands(pose, quaternion)
         values = read_columns(hand, columns, table[:, POSE_NUMBERS:], _refuse)
         joints[name] = read_posture(hand, values, name.removesuffix("_qpos"), _refuse)
     placed = {name: poses[name] @ bench_from_root for name in joints}
@@ -394,18 +399,6 @@ def read_poses(
     )
 
 
-def _poses_of_file(
-    numbers: np.ndarray, quaternion: Quaternion, unit_m: float, world: bool = False
-) -> Float[Tensor, "g 4 4"]:
-    """Return the poses of `read_poses`; warn if their quaternions make sense in the other order.
-
-    They are those of hands, or of objects in the `world`.
-    """
-    poses = read_poses(numbers, quaternion, unit_m)
-    _tell_order(numbers, quaternion, world)
-    return poses
-
-
 def _matrices(numbers: np.ndarray, quaternion: Quaternion) -> Float[np.ndarray, "g 3 3"]:
     """Return the rotations of poses (g, 7), whose quaternions have an order."""
     turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
@@ -414,24 +407,37 @@ def _matrices(numbers: np.ndarray, quaternion: Quaternion) -> Float[np.ndarray, 
     return spatial.transform.Rotation.from_quat(turns).as_matrix()
 
 
-def _tell_order(numbers: np.ndarray, quaternion: Quaternion, world: bool) -> None:
-    """Warn of poses (g, 7) that make sense if their quaternions have the other order.
+def _other(quaternion: Quaternion) -> Quaternion:
+    """Return the other order of a quaternion."""
+    return "wxyz" if quaternion == "xyzw" else "xyzw"
 
-    In the other order alone, the origin, in which the object stands, lies on one side of the hand.
-    Or the poses are those of objects in the `world`: half turns that are no turns in it.
+
+def _tell_turned_objects(numbers: np.ndarray, quaternion: Quaternion) -> None:
+    """Warn of objects' poses (g, 7) that are all half turns, and no turns if their quaternions have
+    the other order.
     """
-    other: Quaternion = "wxyz" if quaternion == "xyzw" else "xyzw"
+    other = _other(quaternion)
     still = np.abs(numbers[:, 3 if other == "wxyz" else 6]) > 1 - ROUNDING
-    sides = {order: _one_side(numbers, order) for order in (quaternion, other)}
-    one_sided = len(numbers) >= ORDER.grasps and sides[other] > ORDER.one_side
-    if world and len(still) and still.all():
-        found = "half turns, and no turns"
-    elif not world and one_sided and sides[quaternion] < ORDER.any_side:
-        found = "hands with the object's origin on any side, and on one side"
-    else:
+    if len(still) and still.all():
+        _warn_of_order(quaternion, "half turns", "no turns")
+
+
+def _tell_scattered_hands(numbers: np.ndarray, quaternion: Quaternion) -> None:
+    """Warn of hands' poses (g, 7) about an object at the origin, if the object is on one side of the
+    hand in the other order of quaternions alone.
+    """
+    if len(numbers) < ORDER.grasps or _one_side(numbers, quaternion) >= ORDER.any_side:
         return
-    fix = f"if they are {other}, say so (--quaternion {other})"
-    warn_user(GraspFileWarning, f"quaternions as {quaternion} are {found} as {other}: {fix}")
+    if _one_side(numbers, _other(quaternion)) > ORDER.one_side:
+        place = "with the object's origin on"
+        _warn_of_order(quaternion, f"hands {place} any side", f"hands {place} one side")
+
+
+def _warn_of_order(quaternion: Quaternion, found: str, otherwise: str) -> None:
+    """Warn that quaternions are `found` in their order, and what they are in the other one."""
+    other = _other(quaternion)
+    text = f"quaternions as {quaternion} are {found}, and {otherwise} as {other}"
+    warn_user(GraspFileWarning, f"{text}: if they are {other}, say so (--quaternion {other})")
 
 
 def _one_side(numbers: np.ndarray, quaternion: Quaternion) -> float:
