@@ -195,8 +195,12 @@ def keep_at_commit(options: Options, name: str) -> Path | None:
     None while the working tree has changes, or without git: then nothing is kept.
     """
     commit = describe_commit()
-    fixed = CHANGED not in commit and commit != UNKNOWN
-    return options.out / name / commit if fixed else None
+    return options.out / name / commit if is_fixed(commit) else None
+
+
+def is_fixed(commit: str) -> bool:
+    """Return whether the text on a commit names one, without changes of the working tree."""
+    return CHANGED not in commit and UNKNOWN not in commit
 
 
 CHOICES = ("only", "out", "publish", "workers")
@@ -215,8 +219,7 @@ def keep_rows(options: Options, name: str, measure_rows: Callable[[], list[Row]]
     path = options.out / "rows" / f"{name}.json"
     if path.is_file():
         content = json.loads(path.read_text("utf-8"))
-        fixed = CHANGED not in run and UNKNOWN not in run
-        if content["head"] == head and fixed:
+        if content["head"] == head and is_fixed(run):
             return [Row(**row) for row in content["rows"]]
     rows = measure_rows()
     content = {"head": head, "rows": list(map(dataclasses.asdict, rows))}

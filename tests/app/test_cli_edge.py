@@ -107,6 +107,7 @@ def test_it_stays_where_it_stands_if_a_grasp_there_is_as_likely_to_hold(
         ([*EDGE[2:], "--fingers", "auto"], ["--fingers auto beside it"]),
         ([*EDGE[2:], "--mode", "paper"], ["--mode beside it"]),
         (["--edge", "0", "0", "0.15", "0", "0", "1"], ["along the table"]),
+        (["--edge", "150", "0", "1", "0"], ["within 2 m, in metres", "149.9 m from all points"]),
     ],
 )
 def test_a_bad_edge_is_refused_in_one_sentence(words, said, low, tmp_path, refusal, monkeypatch):

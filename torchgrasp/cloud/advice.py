@@ -11,7 +11,7 @@ from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
 from torchgrasp.cloud.parts import PARTS, find_ground, find_second_body
 from torchgrasp.cloud.prepare import FACING, INWARD, point_inward, share_facing
-from torchgrasp.cloud.viewpoint import GUESS, UNSEEN, share_unseen
+from torchgrasp.cloud.viewpoint import GUESS, UNSEEN, is_along_z, share_unseen
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial
@@ -36,8 +36,6 @@ class AdviceNumbers:
     """Cosine between a table's normal and the vertical, below which advice names the normal."""
     down: float = 0.15
     """Greatest share of visible normals that point down; a camera above a table sees fewer."""
-    ahead: float = 0.6
-    """A camera in the origin looks along z if the cosine to the cloud is above this."""
     z_up: float = 0.9
     """The vertical is z above this cosine, as where none was given."""
     along: float = 0.8
@@ -241,9 +239,7 @@ def _judge_height(
     level = "the lowest point" if table is None else "the table"
     place = f"{below:.2f} m below {level} along the vertical {_triple(normal)}"
 
-    centre = points.mean(0)
-    ahead = float(centre[2]) > ADVICE.ahead * float(torch.linalg.vector_norm(centre))
-    if ahead and float(up[2]) > ADVICE.z_up and not bool(eye.any()):
+    if is_along_z(points) and float(up[2]) > ADVICE.z_up and not bool(eye.any()):
         axis = torch.tensor([0.0, -1.0, 0.0])
         why = "for a level camera"
         if ground is not None:

@@ -16,7 +16,7 @@ from torchgrasp.cloud.neighbours import NEAR, draw_rows, find_inliers, fit_local
 from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
 from torchgrasp.cloud.safe_files import parse_npy, parse_npz, unread_arrays
-from torchgrasp.cloud.viewpoint import can_see
+from torchgrasp.cloud.viewpoint import can_see, is_along_z
 from torchgrasp.files import explain, read_bounded, write_file
 from torchgrasp.files.columns import find_columns, parse_text
 from torchgrasp.foundation.base import Value, named_tensors
@@ -55,10 +55,6 @@ class ReadNumbers:
     """Least cosine of nearly all normals with their median if they are alike, as one colour is."""
     across: float = 0.1
     """Quantile of the cosines with fitted planes that must be as large if all normals are alike."""
-    ahead: float = 0.6
-    """A camera in the origin looks along z if the cosine to the middle of the points is above this;
-    else z is up.
-    """
     searched: int = 1000
     """Rows, about, among which a place of missing pixels is sought."""
     fewest: int = 100
@@ -476,9 +472,7 @@ def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:
     points = cloud.points[draw_rows(len(cloud), READ.drawn)]
     if bool(points.ne(points[0]).any()):  # else all coincide, which is refused later
         points = points[find_inliers(points)]
-        middle = points.mean(0)
-        ahead = float(middle[2]) > READ.ahead * float(torch.linalg.vector_norm(middle))
-        below = bool((points[:, 2] > 0).all()) and not ahead
+        below = bool((points[:, 2] > 0).all()) and not is_along_z(points)
         origin = torch.zeros(3, dtype=points.dtype)
         if not below and can_see(points, fit_local_planes(points)[0], origin):
             return cloud

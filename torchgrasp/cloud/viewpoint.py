@@ -51,6 +51,10 @@ class GuessNumbers:
     """Most points from which the camera is guessed."""
     half_view: float = 50.0
     """Points of a camera in the origin are at most this far from its axis [deg]."""
+    ahead: float = 0.6
+    """Least cosine between z and the way to the middle of the points, of a camera in the origin that
+    looks along z; else z may be up.
+    """
     far: float = 2.0
     """A cloud whose camera is in the origin is farther from it than this, in radii of the cloud."""
     directions: int = 400
@@ -122,6 +126,12 @@ def _draw(points: Points, normals: Points) -> tuple[Float[Tensor, "m 3"], Float[
     """Return some of the points, with their normals."""
     rows = draw_rows(len(points), GUESS.drawn).to(points.device)
     return points[rows], normals[rows]
+
+
+def is_along_z(points: Points) -> bool:
+    """Return whether a camera in the origin that looks along z has the points (n, 3) [m] ahead."""
+    middle = points.mean(0)
+    return float(middle[2]) > GUESS.ahead * float(torch.linalg.vector_norm(middle))
 
 
 def _is_ahead(points: Points, centre: Vector, radius: Float[Tensor, ""]) -> bool:

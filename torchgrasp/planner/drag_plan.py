@@ -38,7 +38,7 @@ class DragNumbers:
     unsure: float = 0.25
     """this share of the object's reach from its centre to the edge: so far off are estimates."""
     farthest: float = 2.0
-    """Largest distance [m] of the edge from the centre of mass: a larger one is in another unit."""
+    """Largest distance [m] of the edge from the points of the view: a larger one is in another unit."""
     supported: float = 0.004
     """Least distance [m] behind the edge of each pressing tip at the end of the drag."""
     spacing: float = 0.008

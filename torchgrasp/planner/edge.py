@@ -20,6 +20,7 @@ from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse, rigid
+from torchgrasp.geometry.linalg import Points
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.clearance import Obstacles
 from torchgrasp.planner.drag_plan import DRAG, DragPlan, EdgeBalance, find_drag
@@ -102,7 +103,7 @@ def plan_edge_grasps(
     Raises:
         BadArgument: a table without an edge, or one whose edge is more than 15 mm (`DRAG.behind`)
             behind the object's estimated centre of mass: the object would fall. Also one whose edge
-            is more than 2 m (`DRAG.farthest`) from it: its numbers are not metres.
+            is more than 2 m (`DRAG.farthest`) from all points: its numbers are not metres.
         BadArgument: a friction of the fingertips that is not greater than `table_friction`.
 
     >>> import torch
@@ -114,16 +115,15 @@ def plan_edge_grasps(
     table = _table_with_edge(spec)
     friction = _sure_friction(spec, table_friction)
     hand = as_hand(hand, "hand")
-    request = Request(as_seen(cloud, "cloud"), hand, spec, starts, seed, task=task)
+    seen = as_seen(cloud, "cloud")
+    check_edge(table, seen.points, "spec.table")
+    request = Request(seen, hand, spec, starts, seed, task=task)
     object_ = ShapedObject.of(request)
     frame = object_.obj_from_upright
     balance = EdgeBalance.of(object_, table)
     if balance.away < -DRAG.behind:
         found = f"an edge {-1e3 * balance.away:.0f} mm behind the object's centre"
         raise BadArgument("spec.table", found, "an edge beyond it")
-    if balance.away > DRAG.farthest:
-        found = f"an edge {balance.away:.4g} m from the object's centre"
-        raise BadArgument("spec.table", found, f"one within {DRAG.farthest:g} m, in metres")
     mass = Distribution.of(request.grasp_task.mass).most
     load = _weight(mass, table, apply(frame, balance.centre[None])[0])
     request = dataclasses.replace(request, resist=load)
@@ -149,6 +149,19 @@ def _table_with_edge(spec: ContactSpec) -> Plane:
         found = "no table" if table is None else "a table without an edge"
         raise BadArgument("spec.table", found, "a plane with an edge (`Plane.ending`)")
     return table.to("cpu", torch.float64)
+
+
+def check_edge(table: Plane, points: Points, name: str) -> None:
+    """Raise `BadArgument` if a table's edge is so far beyond all points (n, 3) [m] of a view that
+    its numbers are not metres.
+
+    Errors call the table by `name`.
+    """
+    assert table.edge is not None
+    away = -float(table.edge.to("cpu", torch.float64).height(points.cpu().double()).max())
+    if away > DRAG.farthest:
+        found = f"an edge {away:.4g} m from all points"
+        raise BadArgument(name, found, f"one within {DRAG.farthest:g} m, in metres")
 
 
 def _sure_friction(spec: ContactSpec, table_friction: float) -> float:

@@ -203,17 +203,13 @@ def tell_rays(image: DepthImage) -> tuple[str, ...]:
 
     As distances, they would put far more points into one plane.
     """
-    k = image.intrinsics.double()
     row, column = torch.nonzero(image.depth > 0, as_tuple=True)
     step = 1 + len(row) // RAYS.drawn
     row = row[::step]
     column = column[::step]
-    # rays at depth 1
-    rays = torch.stack(
-        [(column - k[0, 2]) / k[0, 0], (row - k[1, 2]) / k[1, 1], torch.ones_like(row)], -1
-    )
-    seen = image.depth[row, column].double()[:, None] * rays
-    nearer = seen / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
+    # in the camera's frame: as they are, and at their depth along their rays
+    seen = dataclasses.replace(image, obj_from_camera=torch.eye(4)).points()[row, column]
+    nearer = seen[:, 2:] * unit(seen)
     height, width = image.depth.shape
     patch = row * RAYS.patches // height * RAYS.patches + column * RAYS.patches // width
     # of few points, neither share is known

@@ -50,7 +50,7 @@ from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surfac
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.clearing import order_to_clear
 from torchgrasp.planner.drag_plan import DragPlan
-from torchgrasp.planner.edge import EdgePlan, plan_edge_grasps
+from torchgrasp.planner.edge import EdgePlan, check_edge, plan_edge_grasps
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
@@ -246,6 +246,7 @@ class Grasp(ForPrograms):
         table = view.plane(cloud)
         if self.edge is not None:
             table = inputs.with_edge(table, self.edge)
+            check_edge(table, cloud.points, "--edge")
         plane = as_plane(table)
         make_spec = ContactSpec.paper if self.mode == "paper" else ContactSpec
         spec = make_spec(friction=self._friction, table=table)

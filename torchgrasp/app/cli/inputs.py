@@ -38,7 +38,6 @@ from torchgrasp.values.specs import Simulator
 
 WIDEST = 1.5  # tangent of half an angle of view wider than that of depth cameras
 MOST_UNSEEN = 0.01  # share of the points outside: more, and the cloud is in another frame
-FAR_EDGE = 10.0  # coordinate of an edge [m] above which its unit is told
 LEVEL = 0.9  # least upward part of a table's unit normal where x and y say where its edge is
 MOST_POINTS = 100_000  # most points of a file that are used; a shape is fitted to fewer
 CLOUD_HELP = "point cloud of one object (.ply, .pcd, .npy, .npz, or text as .xyz, .csv, .pts)"
@@ -240,9 +239,6 @@ def with_edge(table: Plane | float | None, edge: tuple[float, ...]) -> Plane:
         raise BadArgument("--edge", f"{len(edge)} numbers", wanted)
     numbers = check_tensor("--edge", real(edge), (len(edge),))
     point, outward = numbers.chunk(2)
-    if float(point.abs().max()) > FAR_EDGE:
-        far = f"a point {float(torch.linalg.vector_norm(point)):.4g} m from the frame's origin"
-        print_notes((f"--edge: {far}: its numbers are metres, also with --unit",))
     if not bool(outward.any()):
         wanted = "the direction away from the table"
         raise BadArgument("--edge", "a direction of length zero", wanted)
