@@ -55,13 +55,13 @@ def kept() -> Iterator[None]:
     each hand, once for all tests.
     """
     from torchgrasp.foundation.errors import NoSupport
-    from torchgrasp.geometry import support_planes
+    from torchgrasp.geometry import support_search
     from torchgrasp.ik import seeds
     from torchgrasp.planner.objects import ShapedObject
 
     shaped = ShapedObject.of
     draw = seeds.PostureLibrary._drawn
-    find = support_planes.find_supports
+    find = support_search.find_supports
 
     def supports(*arguments: Any, **options: Any) -> Any:
         def compute() -> Any:
@@ -100,7 +100,7 @@ def kept() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ShapedObject, "of", shape)
         patch.setattr(seeds.PostureLibrary, "_drawn", library)
-        for module in ("geometry.support_planes", "cloud.parts", "cloud.viewpoint"):
+        for module in ("geometry.support_search", "cloud.parts", "cloud.viewpoint"):
             patch.setattr(f"torchgrasp.{module}.find_supports", supports)
         yield
 

@@ -14,7 +14,7 @@ from tests.make import HALF, box, halved
 from torchgrasp import Scene, Status, load_grasps, read_scene, save_scene
 from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.geometry.support_planes import find_supports
+from torchgrasp.geometry.support_search import find_supports
 from torchgrasp.planner import ScenePlan, ThingPlan
 
 CAMERA = look_at(20.0, 45.0, 0.7)
@@ -221,7 +221,7 @@ def test_planes_are_searched_once_at_most(
         calls.append(arguments)
         return find_supports(*arguments, **options)
 
-    monkeypatch.setattr("torchgrasp.geometry.support_planes.find_supports", count)
+    monkeypatch.setattr("torchgrasp.geometry.support_search.find_supports", count)
     bare = {name: seen[name] for name in ("depth", "intrinsics", "camera_pose")}
     np.savez(tmp_path / "s.npz", **bare)
     grasp_on(*options)

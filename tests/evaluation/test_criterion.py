@@ -11,7 +11,7 @@ import torch
 
 from torchgrasp import Status, TrialSpec
 from torchgrasp.control import TipContact
-from torchgrasp.evaluation.lift import LIFT_TIME, _Lift
+from torchgrasp.evaluation.lift import LIFT_TIME, RecordedLift
 from torchgrasp.evaluation.trial import TrialRun
 from torchgrasp.geometry.frames import rotation_from_vector
 
@@ -92,7 +92,7 @@ class Authored(TrialRun):
 
 
 def verdict(*arguments, **options):
-    return _Lift(Authored(*arguments, **options)).perform()
+    return RecordedLift(Authored(*arguments, **options)).perform()
 
 
 def slipping(place=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), begin=0.1):
@@ -154,7 +154,7 @@ def test_motion_with_the_hand_is_no_slip():
     run = Authored(None)
     carried = lambda: at([0.1 * run.height, 0.0, run.height], [0.0, 0.0, 10.0 * run.height])  # noqa: E731
     run.scene.hand_pose = run.scene.object_pose = carried
-    assert _Lift(run).perform() is Status.OK
+    assert RecordedLift(run).perform() is Status.OK
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_an_object_is_held_until_the_end_of_the_hold_time(hold, found):
     """The object slips out of the limits half a second after the lift."""
     spec = TrialSpec(hold_time=hold)
     run = Authored(slipping([0.0, 0.03, 0.0], begin=LIFT_TIME + 0.5), spec=spec)
-    assert _Lift(run).perform() is found
+    assert RecordedLift(run).perform() is found
     assert run.time == pytest.approx(LIFT_TIME + hold, abs=1e-9)
 
 
@@ -206,7 +206,7 @@ def test_the_first_reason_is_told_for_an_object_that_stays_behind(touched, pushe
 def test_a_trial_ends_early_when_the_object_is_far_away(gone, found):
     """Half a metre beyond the lift of 0.1 m."""
     run = Authored(lambda time, height: at([gone * (time > 0.5), 0.0, 0.0]))
-    assert _Lift(run).perform() is not Status.OK
+    assert RecordedLift(run).perform() is not Status.OK
     assert (run.time > 1.0) is found
 
 

@@ -24,7 +24,7 @@ from tests.pinch import (
 from torchgrasp import Plane, TrialSpec, close_hand, load_hand
 from torchgrasp.control import observe
 from torchgrasp.evaluation import GraspTrial, Truth
-from torchgrasp.evaluation.lift import LIFT_TIME, _Lift, lift_grasp
+from torchgrasp.evaluation.lift import LIFT_TIME, RecordedLift, lift_grasp
 from torchgrasp.evaluation.trial import TrialDriver, derive_reference
 from torchgrasp.foundation.errors import BadArgument, MeshError, Status
 from torchgrasp.geometry.frames import inverse
@@ -199,7 +199,7 @@ def test_the_palm_follows_an_object_that_stands_elsewhere():
 
 def test_an_object_that_slips_in_the_hand_is_not_held(monkeypatch):
     pytest.importorskip("sapien")
-    trial = _Lift(
+    trial = RecordedLift(
         TrialDriver(GraspTrial(*pinch("allegro"), Truth(cylinder((0.0, 0.008)))), QUICK).open()
     )
     assert trial.perform() is Status.OK

@@ -8,7 +8,7 @@ from tests.make import box, real
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
-from torchgrasp.geometry.support_planes import find_supports
+from torchgrasp.geometry.support_search import find_supports
 from torchgrasp.scene.image import read_image
 
 POSE = look_at(30.0, 40.0, 0.6)

@@ -86,7 +86,7 @@ def test_a_cylinder_is_lifted_through_messages(file, feel, rate):
     )
     driver.say(driver.loop.pregrasp)
     assert driver.loop.close()
-    trial = lift._Lift(run)
+    trial = lift.RecordedLift(run)
     result = trial.result(trial.perform(), 0.0)
     assert result.held and result.contact_order and result.rise > 0.05
     assert float(result.forces[-1].max()) < 6.0  # 4 N are asked of the strongest finger

@@ -16,7 +16,8 @@ from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.linalg import Points, Vector, number_components
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support_planes import SUPPORTS, SupportPlane, find_supports
+from torchgrasp.geometry.support_planes import SUPPORTS, SupportPlane
+from torchgrasp.geometry.support_search import find_supports
 from torchgrasp.values.planning import PointCloud
 
 

@@ -24,7 +24,8 @@ from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import PLANES
-from torchgrasp.geometry.support_planes import SupportPlane, Target, find_table
+from torchgrasp.geometry.support_planes import SupportPlane
+from torchgrasp.geometry.support_search import Target, find_table
 
 Transform = Float[Tensor, "4 4"]
 UNIT = "depth in metres: depth_unit (--depth-unit) says how many metres a count is"

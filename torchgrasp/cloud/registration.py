@@ -25,7 +25,7 @@ from torchgrasp.cloud.neighbours import draw_rows, find_inliers, usual_spacing
 from torchgrasp.foundation.errors import BadArgument, MendedInput
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.told import warn_user
-from torchgrasp.geometry.frames import rigid, rotation_angle, rotation_from_vector
+from torchgrasp.geometry.frames import rotation_angle, rotation_from_vector, turned_about
 from torchgrasp.geometry.linalg import Points, Vector, norm, unit
 from torchgrasp.values.planning import PointCloud
 
@@ -364,7 +364,7 @@ def _find_motion(fixed: _ViewSurface, view: _ViewSurface) -> Motion | None:
     hidden = min(spread / float((by_step.square() / prior).sum()), MOTION.hidden)
     unsure = distance * math.sqrt(hidden / (1 - hidden))
     rotation = rotation_from_vector(step[3:])
-    pose = rigid(rotation, centre + step[:3] - rotation @ centre)
+    pose = turned_about(rotation, centre, step[:3])
     left = MOTION.gaussian * float(height.abs().median())
     chi_squared = float(step @ (moments - torch.diag(prior)) @ step)
     return Motion(pose, float(step[:3].norm()), distance, unsure, left, chi_squared)

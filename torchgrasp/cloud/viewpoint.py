@@ -12,7 +12,7 @@ from torchgrasp.cloud.neighbours import draw_rows, nearest
 from torchgrasp.foundation.errors import NoSupport
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, Vector, fibonacci_sphere, unit
-from torchgrasp.geometry.support_planes import find_supports
+from torchgrasp.geometry.support_search import find_supports
 
 
 @dataclasses.dataclass(frozen=True)

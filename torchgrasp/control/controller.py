@@ -31,7 +31,7 @@ from torchgrasp.foundation.base import check_device, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector, turned_about
 from torchgrasp.values.closing import ClosingOptions, choose_options
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import PointCloud
@@ -211,7 +211,7 @@ class GraspController:
         centre = self.reference.gains.target.mean(0)
         shift = closing.displacement[:3]
         rotation = rotation_from_vector(closing.displacement[3:])
-        return rigid(rotation, centre + shift - rotation @ centre)
+        return turned_about(rotation, centre, shift)
 
     @property
     def object_motion(self) -> Float[Tensor, "4 4"]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.checks import checked
-from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.frames import rotation_from_vector, turned_about
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
@@ -72,7 +72,7 @@ def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> F
     distance, _ = surface.query(search.undo(motions))
     found = motions[search.cost(distance).argmin()]
     rotation = rotation_from_vector(found[2] * search.up)
-    return rigid(rotation, search.pivot + found[:2] @ search.axes - rotation @ search.pivot)
+    return turned_about(rotation, search.pivot, found[:2] @ search.axes)
 
 
 class _Registration:

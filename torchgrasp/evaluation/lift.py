@@ -147,14 +147,14 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
 
 def run_lift(driver: TrialDriver) -> ClosureResult:
     """Run the lift trial of a driver in a fresh scene, and return its record."""
-    return _Lift(driver.open()).complete()
+    return RecordedLift(driver.open()).complete()
 
 
 class _ObjectLost(Exception):
     """Raised when the object is too far away to continue the trial."""
 
 
-class _Lift:
+class RecordedLift:
     """One lift trial and the record of its ticks."""
 
     def __init__(self, run: TrialRun) -> None:

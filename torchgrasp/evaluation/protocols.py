@@ -18,7 +18,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Count, Length, Pose, Range, Seed
-from torchgrasp.geometry.frames import inverse, real, rigid, rotation_from_vector
+from torchgrasp.geometry.frames import inverse, real, rigid, rotation_from_vector, turned_about
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values.distribution import Distribution
@@ -284,7 +284,7 @@ def draw_object_poses(
     up = real([0.0, 0.0, 1.0])
     rotation = rotation_from_vector(noise.rotation * drawn[:, :1] * up)
     shift = noise.translation * drawn[:, [1, 2, 2]] * (1 - up)
-    return rigid(rotation, shift + pivot - rotation @ pivot)
+    return turned_about(rotation, pivot, shift)
 
 
 def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tensor, "4 4"]:

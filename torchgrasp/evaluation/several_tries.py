@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.regrasp import GraspTry
-from torchgrasp.evaluation.lift import _Lift
+from torchgrasp.evaluation.lift import RecordedLift
 from torchgrasp.evaluation.protocols import apply_error, seed_of
 from torchgrasp.evaluation.trial import (
     GraspTrial,
@@ -103,7 +103,7 @@ def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry,
         assert run is not None
         # the last try goes on whatever the hand feels
         last = len(done) + 1 >= tries or not len(attempt.others)
-        lift = _Lift(run) if last else _CheckedLift(run, attempt)
+        lift = RecordedLift(run) if last else _CheckedLift(run, attempt)
         result = lift.complete()
         done.append(LiftTry(attempt.row, result))
         if last or not (attempt.lost or result.status is Status.TOO_HEAVY):
@@ -112,7 +112,7 @@ def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry,
     return tuple(done)
 
 
-class _CheckedLift(_Lift):
+class _CheckedLift(RecordedLift):
     """A lift that ends where the robot feels that it has failed."""
 
     def __init__(self, run: TrialRun, attempt: GraspTry) -> None:

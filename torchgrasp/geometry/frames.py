@@ -32,6 +32,13 @@ def rigid(
     return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
 
 
+def turned_about(
+    rotation: Float[Tensor, "*b 3 3"], point: Float[Tensor, "3"], shift: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 4 4"]:
+    """Return the rigid transform that turns about a point (3,) [m], and then shifts [m]."""
+    return rigid(rotation, point + shift - rotation @ point)
+
+
 def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     """Return the inverse `b_from_a` of a rigid transform `a_from_b`; translations are in metres."""
     rotation = a_from_b[..., :3, :3].mT

@@ -15,7 +15,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import to_upright, upright_frame
-from torchgrasp.geometry.support_planes import find_table
+from torchgrasp.geometry.support_search import find_table
 from torchgrasp.hand.hand import Hand
 from torchgrasp.scene.scene import Scene
 from torchgrasp.scene.segment import SEGMENT

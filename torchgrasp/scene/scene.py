@@ -25,7 +25,8 @@ from torchgrasp.foundation.rules import Pose, Positive
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import Points, norm
 from torchgrasp.geometry.plane import Plane, to_upright
-from torchgrasp.geometry.support_planes import SupportPlane, Target, find_table
+from torchgrasp.geometry.support_planes import SupportPlane
+from torchgrasp.geometry.support_search import Target, find_table
 from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import (
     DepthImage,
