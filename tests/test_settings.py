@@ -19,11 +19,19 @@ from tests.hostile.arguments import checked_things, required
 from tests.hostile.samples import hints_of
 from tests.hostile.unchanged import digest
 from tests.settings import changed, other_settings
-from torchgrasp import Contacts, ContactSpec, certify, load_hand, load_object, stream_grasps
+from torchgrasp import (
+    Contacts,
+    ContactSpec,
+    certify,
+    load_hand,
+    load_object,
+    plan_grasps,
+    stream_grasps,
+)
 from torchgrasp.control import DragController
 from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Count
 from torchgrasp.foundation.settings import usual_settings
 
@@ -89,6 +97,19 @@ def test_a_public_function_has_the_same_bits_under_other_settings(name: str, tmp
         assert found == inferred == plain
         if "Error" not in plain and "Bad" not in plain:  # else it takes double precision alone
             break
+
+
+@pytest.mark.promise("N10")
+def test_a_plan_over_a_table_has_the_same_bits_under_other_settings():
+    view = load_object("jug").view
+    hand = load_hand("allegro")
+    spec = ContactSpec(table=0.0)
+    with other_settings():
+        found = plan_grasps(view, hand, spec, starts=80)
+    plain = plan_grasps(view, hand, spec, starts=80)
+    assert (plain.status == Status.OK).any()
+    for name in ("joints", "obj_from_hand", "score", "status"):
+        assert getattr(found, name).equal(getattr(plain, name))
 
 
 @pytest.mark.parametrize("dtype", HALVES)

@@ -288,7 +288,9 @@ def sphere_rows(
     if world.plane is not None:
         height = level(centres, world.plane) - radius - world.plane.offset
         # contacts tell how low tips are
-        found.append(height + CLEARANCE * spheres.touching if tips_touch else height)
+        if tips_touch:
+            height = torch.where(spheres.touching, height + CLEARANCE, height)
+        found.append(height)
     if not found:
         return []
     count = min(HINGES, len(radius))
