@@ -15,7 +15,7 @@ import torch
 from torchgrasp.contacts import problem as constraint
 from torchgrasp.contacts import solver
 from torchgrasp.foundation.fused import array, compiled, inlined
-from torchgrasp.geometry.fused_vectors import add, dot, factorise, put, solve_factorised
+from torchgrasp.geometry.fused_vectors import add, copy, dot, factorise, put, solve_factorised
 from torchgrasp.shape.estimate import SurfaceJet
 from torchgrasp.shape.fused_jets import arrays_of, sum_thin_plate
 from torchgrasp.shape.gp import ShapeGP
@@ -196,7 +196,7 @@ def _descend(
         np.empty((u, u)),
         np.empty(u),
     )
-    new_value, new_weight, new_residual = np.empty(rows), np.empty(rows), np.empty(rows)
+    new_weight, new_residual = np.empty(rows), np.empty(rows)
     room = np.empty((f, 3)), np.empty((f, 3, 3))
     new = (
         np.empty((f, 3)),
@@ -209,7 +209,7 @@ def _descend(
     )
     for s in range(b):
         old = (points[s], tension[s], distance[s], gradient[s], hessian[s], variance[s], slope[s])
-        new[6][:] = slope[s]
+        copy(new[6], slope[s])
         _constrain(n, old, pairs, signs, up, room, value, jacobian)
         cost = _weigh(n, f, value, weight, residual)
         damping = n.first
@@ -217,8 +217,8 @@ def _descend(
             if not _step(n, f, damping, weight, residual, jacobian, matrix, x):
                 break
             _move(n, thin, pairs, signs, old, x, new)
-            inside = _constrain(n, new, pairs, signs, up, room, new_value, other)
-            trial = _weigh(n, f, new_value, new_weight, new_residual)
+            inside = _constrain(n, new, pairs, signs, up, room, value, other)
+            trial = _weigh(n, f, value, new_weight, new_residual)
             promised = 0.0
             for r in range(rows):
                 linear = residual[r]
@@ -230,14 +230,19 @@ def _descend(
                 eased = min(max(1 - (2 * kept - 1) ** 3, 1 / 5), 2.0)
                 damping = max(damping * eased, n.least)
                 cost = trial
-                points[s], tension[s], distance[s] = new[0], new[1], new[2]
-                gradient[s], hessian[s], variance[s] = new[3], new[4], new[5]
-                value[:], weight[:], residual[:] = new_value, new_weight, new_residual
-                jacobian[:] = other
+                copy(points[s], new[0])
+                copy(tension[s], new[1])
+                copy(distance[s], new[2])
+                copy(gradient[s], new[3])
+                copy(hessian[s], new[4])
+                copy(variance[s], new[5])
+                weight, new_weight = new_weight, weight
+                residual, new_residual = new_residual, residual
+                jacobian, other = other, jacobian
             else:
                 damping = min(4 * damping, n.most)
-                jacobian += other
-                jacobian /= 2
+                for k in range(jacobian.size):
+                    jacobian.flat[k] = (jacobian.flat[k] + other.flat[k]) / 2
 
 
 def descend(

@@ -29,6 +29,13 @@ def put(row, v):
 
 
 @inlined
+def copy(to, values):
+    """Write an array of any shape into another one; an assignment takes seconds to compile."""
+    for k in range(values.size):
+        to.flat[k] = values.flat[k]
+
+
+@inlined
 def factorise(matrix):
     """Replace the lower half of a matrix by its Cholesky factor; return whether there is one."""
     for i in range(len(matrix)):

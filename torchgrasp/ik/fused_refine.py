@@ -18,6 +18,7 @@ from torch import Tensor
 from torchgrasp.foundation.fused import array, compiled, inlined
 from torchgrasp.geometry.fused_vectors import (
     add,
+    copy,
     cross,
     dot,
     factorise,
@@ -83,7 +84,8 @@ def _place(frame, v):
 @inlined
 def _place_links(h, joints, pose, frames):
     """Write the columns of all link poses, as `KinematicTree.frames`."""
-    frames[0] = pose[:3].T
+    for c in range(4):
+        put(frames[0, c], pose[:3, c])
     for k in range(1, len(frames)):
         j = h.joint[k]
         q = h.offset[j]
@@ -401,7 +403,10 @@ def _step(n, damping, residual, jacobian, matrix, x):
         x[:] = 0.0
         return
     solve_factorised(matrix, x)
-    x *= n.largest / max(n.largest, np.abs(x).max())
+    most = n.largest
+    for change in x:
+        most = max(most, abs(change))
+    x *= n.largest / most
 
 
 @inlined
@@ -410,7 +415,7 @@ def _move(h, joints, pose, x, new_joints, new_pose):
     free = len(x) - len(joints)
     for a in range(len(joints)):
         new_joints[a] = min(max(joints[a] + x[free + a], h.lower[a]), h.upper[a])
-    new_pose[:] = pose
+    copy(new_pose, pose)
     if not free:
         return
     vector = (x[3], x[4], x[5])
@@ -454,7 +459,7 @@ def _solve(h, parts, n, joints, poses, target, normals, residual, jacobian, pads
     for g in range(len(joints)):
         own = (target[g], normals[g], room)
         cost = _evaluate(h, parts, n, joints[g], poses[g], *own, residual[g], jacobian[g])
-        pads[g] = room[3]
+        copy(pads[g], room[3])
         damping = n.first
         for _ in range(n.steps):
             if cost < n.solved or damping == math.inf:
@@ -466,10 +471,10 @@ def _solve(h, parts, n, joints, poses, target, normals, residual, jacobian, pads
                 rests = new > (1 - n.stalled) * cost
                 after = damping / n.fall
                 cost = new
-                joints[g] = new_joints
-                poses[g] = new_pose
-                residual[g] = trial[0]
-                jacobian[g] = trial[1]
+                copy(joints[g], new_joints)
+                copy(poses[g], new_pose)
+                copy(residual[g], trial[0])
+                copy(jacobian[g], trial[1])
             else:
                 rests = damping > n.lost
                 after = damping * n.rise
