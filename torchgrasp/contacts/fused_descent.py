@@ -15,7 +15,15 @@ import torch
 from torchgrasp.contacts import problem as constraint
 from torchgrasp.contacts import solver
 from torchgrasp.foundation.fused import array, compiled, inlined
-from torchgrasp.geometry.fused_vectors import add, copy, dot, factorise, put, solve_factorised
+from torchgrasp.geometry.fused_vectors import (
+    add,
+    copy,
+    dot,
+    factorise,
+    put,
+    scale,
+    solve_factorised,
+)
 from torchgrasp.shape.estimate import SurfaceJet
 from torchgrasp.shape.fused_jets import arrays_of, sum_thin_plate
 from torchgrasp.shape.gp import ShapeGP
@@ -54,7 +62,7 @@ def _constrain(n, contacts, pairs, signs, up, room, value, jacobian):
         x = points[i]
         own = slice(3 * i, 3 * i + 3)
         steep = math.sqrt(dot(gradient[i], gradient[i]))
-        put(normals[i], add((0.0, 0.0, 0.0), gradient[i], 1 / steep))
+        put(normals[i], scale(gradient[i], 1 / steep))
         # the tip's centre moves by 1 + radius (1 - n n^T) H / |g|
         for c in range(3):
             along = dot(normals[i], hessian[i, :, c])
@@ -70,18 +78,18 @@ def _constrain(n, contacts, pairs, signs, up, room, value, jacobian):
         put(jacobian[3 + i, own], gradient[i])
         row = 3 + 2 * f + i
         value[row] = (variance[i] - n.threshold) / n.half_slope
-        put(jacobian[row, own], add((0.0, 0.0, 0.0), slope[i], 1 / n.half_slope))
+        put(jacobian[row, own], scale(slope[i], 1 / n.half_slope))
         row += f
         value[row] = (square - n.ball**2) / (2 * n.ball)
-        put(jacobian[row, own], add((0.0, 0.0, 0.0), x, 1 / n.ball))
+        put(jacobian[row, own], scale(x, 1 / n.ball))
         # the friction cone, as `_cones`
         row = 3 + f + i
         force = _force(i, points, tension, pairs, signs)
         size = math.sqrt(dot(force, force))
-        force = add((0.0, 0.0, 0.0), force, 1 / size)
+        force = scale(force, 1 / size)
         outward = dot(normals[i], force)
-        by_force = add((0.0, 0.0, 0.0), add(normals[i], force, -outward), 1 / size)
-        across = add((0.0, 0.0, 0.0), add(force, normals[i], -outward), 1 / steep)
+        by_force = scale(add(normals[i], force, -outward), 1 / size)
+        across = scale(add(force, normals[i], -outward), 1 / steep)
         value[row] = outward + n.cone
         for c in range(3):
             jacobian[row, 3 * i + c] = dot(across, hessian[i, :, c])
@@ -160,7 +168,7 @@ def _move(n, thin, pairs, signs, old, x, new):
     for i in range(f):
         put(points[i], add(old[0][i], x[3 * i : 3 * i + 3], 1.0))
         value, slope, _ = sum_thin_plate(points[i], y, a, b, psi, False)
-        newton = add((0.0, 0.0, 0.0), slope, -value / dot(slope, slope))
+        newton = scale(slope, -value / dot(slope, slope))
         short = n.longest / max(math.sqrt(dot(newton, newton)), n.longest)
         put(points[i], add(points[i], newton, short))
         distance[i], slope, curved = sum_thin_plate(points[i], y, a, b, psi, True)

@@ -22,6 +22,12 @@ def add(a, b, factor):
 
 
 @inlined
+def scale(v, factor):
+    """Return a vector times a factor, as a tuple."""
+    return v[0] * factor, v[1] * factor, v[2] * factor
+
+
+@inlined
 def put(row, v):
     """Write a vector into a row of an array."""
     for k in range(3):

@@ -23,6 +23,7 @@ from torchgrasp.geometry.fused_vectors import (
     dot,
     factorise,
     put,
+    scale,
     solve_factorised,
 )
 from torchgrasp.geometry.optim import LeastSquares
@@ -72,12 +73,13 @@ class WorldPart(NamedTuple):
 @inlined
 def _turn(frame, v):
     """Return a direction in the frame in which the columns of a pose, the rows of `frame`, are."""
-    turned = add((0.0, 0.0, 0.0), frame[0], v[0])
+    turned = scale(frame[0], v[0])
     return add(add(turned, frame[1], v[1]), frame[2], v[2])
 
 
 @inlined
 def _place(frame, v):
+    """Return a point in that frame."""
     return add(_turn(frame, v), frame[3], 1.0)
 
 
@@ -114,6 +116,7 @@ def _differentiate(steps, twists, moves, force, torque, row):
 
 @inlined
 def _reach(axes, half, direction):
+    """Return how far a box reaches from its centre in a direction."""
     reach = 0.0
     for i in range(3):
         reach += half[i] * abs(dot(axes[i], direction))
@@ -139,12 +142,11 @@ def _part_boxes(a, b, gap, half_a, half_b, apart, n):
     edge_a = edge_b = number = -1
     push = (0.0, 0.0, 0.0)
     for k in range(15):
-        i = k if k < 3 else -1
-        j = k - 3 if 3 <= k < 6 else -1
+        i = j = -1
         if k < 3:
-            axis = add(push, a[k], 1.0) if number < 0 else (a[k, 0], a[k, 1], a[k, 2])
+            axis = scale(a[k], 1.0)
         elif k < 6:
-            axis = (b[k - 3, 0], b[k - 3, 1], b[k - 3, 2])
+            axis = scale(b[k - 3], 1.0)
         else:
             i = (k - 6) // 3
             j = (k - 6) % 3
@@ -152,7 +154,7 @@ def _part_boxes(a, b, gap, half_a, half_b, apart, n):
             square = dot(axis, axis)
             if square <= n.parallel:
                 continue
-            axis = add((0.0, 0.0, 0.0), axis, 1 / math.sqrt(square))
+            axis = scale(axis, 1 / math.sqrt(square))
         along = abs(dot(axis, gap)) - _reach(a, half_a, axis) - _reach(b, half_b, axis)
         if along > best:
             best = along
@@ -161,15 +163,13 @@ def _part_boxes(a, b, gap, half_a, half_b, apart, n):
             edge_a = i
             edge_b = j
     if apart > best:
-        return apart, add((0.0, 0.0, 0.0), gap, 1 / math.sqrt(dot(gap, gap))), (0.0, 0.0, 0.0)
+        return apart, scale(gap, 1 / math.sqrt(dot(gap, gap))), (0.0, 0.0, 0.0)
     if best >= n.between:
         return best, push, push
     if dot(push, gap) < 0:
-        push = add((0.0, 0.0, 0.0), push, -1.0)
-    if number < 6:
-        edge_a = edge_b = -1
+        push = scale(push, -1.0)
     of_a = _corner(a, half_a, push, edge_a)
-    of_b = add((0.0, 0.0, 0.0), _corner(b, half_b, push, edge_b), -1.0)
+    of_b = scale(_corner(b, half_b, push, edge_b), -1.0)
     if number < 3:
         return best, push, of_b
     if number < 6:
@@ -194,12 +194,11 @@ def _part_ball(axes, gap, half, radius, n):
             push = add(push, axes[i], sign * out)
         if out > inside:
             inside = out
-            face = add((0.0, 0.0, 0.0), axes[i], sign)
+            face = scale(axes[i], sign)
     if inside <= 0:
         return inside - radius, face
     length = math.sqrt(dot(push, push))
-    scale = 1 / max(length, math.sqrt(n.least_square))
-    return length - radius, add((0.0, 0.0, 0.0), push, scale)
+    return length - radius, scale(push, 1 / max(length, math.sqrt(n.least_square)))
 
 
 @inlined
@@ -224,11 +223,11 @@ def _part_links(h, n, frames, twists, axes, centers, residual, jacobian):
             at = add(centers[b], arm, 1.0)
         elif p < h.kinds[0] + h.kinds[1]:
             separation, push = _part_ball(axes[b], gap, h.shape_half[b], h.shape_radius[a], n)
-            at = add(centers[a], gap, 0.0)
+            at = scale(centers[a], 1.0)
         else:
             separation = apart
-            push = add((0.0, 0.0, 0.0), gap, 1 / length)
-            at = add(centers[b], gap, 0.0)
+            push = scale(gap, 1 / length)
+            at = scale(centers[b], 1.0)
         lack = (n.between - separation) * n.unit
         k = used
         if used == len(residual):  # more than enough: the greatest count
@@ -238,15 +237,22 @@ def _part_links(h, n, frames, twists, axes, centers, residual, jacobian):
         used = min(used + 1, len(residual))
         residual[k] = lack
         jacobian[k] = 0.0
-        force = add((0.0, 0.0, 0.0), push, -n.unit)
+        force = scale(push, -n.unit)
         _differentiate(h.steps, twists, h.pair_moves[p], force, cross(at, force), jacobian[k])
 
 
 @inlined
 def _cell(part, p, axis):
-    """Return the coordinate of a point in a grid [nodes], and that of the nearest point inside."""
-    at = (p[axis] - part.origin[axis]) / part.spacing
-    return at, min(max(at, 0.0), part.shape[axis] - 1.0)
+    """Return the coordinate of a point in a grid [nodes]."""
+    return (p[axis] - part.origin[axis]) / part.spacing
+
+
+@inlined
+def _inside(part, at, axis):
+    """Return the nearest coordinate inside the grid; 0 for NaN, which would be no index."""
+    last = part.shape[axis] - 1.0
+    at = at if at > 0.0 else 0.0
+    return at if at < last else last
 
 
 @inlined
@@ -256,23 +262,22 @@ def _coarse(part, p):
         return dot(p, part.origin) - part.spacing
     number = 0
     for axis in range(3):
-        at, _ = _cell(part, p, axis)
-        node = min(max(np.rint(at), 0.0), part.shape[axis] - 1.0)
+        node = _inside(part, np.rint(_cell(part, p, axis)), axis)
         number = number * part.shape[axis] + int(node)
     return part.values[number]
 
 
 @inlined
 def _lerp(a, b, share):
+    """Return the number at a share of the way from a to b."""
     return a + share * (b - a)
 
 
 @inlined
 def _exact(part, p):
     """Return distance and gradient, as `DistanceField.query`."""
-    x, inside_x = _cell(part, p, 0)
-    y, inside_y = _cell(part, p, 1)
-    z, inside_z = _cell(part, p, 2)
+    x, y, z = _cell(part, p, 0), _cell(part, p, 1), _cell(part, p, 2)
+    inside_x, inside_y, inside_z = _inside(part, x, 0), _inside(part, y, 1), _inside(part, z, 2)
     nx, ny, nz = part.shape
     i = min(int(inside_x), nx - 2)
     j = min(int(inside_y), ny - 2)
@@ -294,7 +299,7 @@ def _exact(part, p):
     beyond = (x - inside_x) * h, (y - inside_y) * h, (z - inside_z) * h
     away = math.sqrt(dot(beyond, beyond))
     if away == 0.0:
-        return distance, add((0.0, 0.0, 0.0), slope, 1 / h)
+        return distance, scale(slope, 1 / h)
     gx = slope[0] / h if beyond[0] == 0.0 else beyond[0] / away
     gy = slope[1] / h if beyond[1] == 0.0 else beyond[1] / away
     gz = slope[2] / h if beyond[2] == 0.0 else beyond[2] / away
@@ -324,7 +329,7 @@ def _clear(h, n, part, spheres, twists, order, index, residual, jacobian):
             clearance = distance + part.grown[index[k]]
         if clearance < n.clearance:
             residual[k] = (n.clearance - clearance) * n.unit
-            force = add((0.0, 0.0, 0.0), slope, -n.unit)
+            force = scale(slope, -n.unit)
             moves = h.moves[h.sphere_link[index[k]]]
             _differentiate(h.steps, twists, moves, force, cross(p, force), jacobian[k])
 
@@ -358,7 +363,7 @@ def _evaluate(h, parts, n, joints, pose, target, normals, room, residual, jacobi
         if outside > 0:
             row = 3 * tips + f
             residual[row] = n.pad * outside
-            torque = add((0.0, 0.0, 0.0), cross(pad, normals[f]), n.pad)
+            torque = scale(cross(pad, normals[f]), n.pad)
             _differentiate(h.steps, twists, moves, (0.0, 0.0, 0.0), torque, jacobian[row])
     first = 4 * tips
     last = first + min(n.hinges, len(h.pairs))
@@ -371,11 +376,12 @@ def _evaluate(h, parts, n, joints, pose, target, normals, room, residual, jacobi
             last = first + len(order)
             own = residual[first:last], jacobian[first:last]
             _clear(h, n, part, spheres, twists, order, index, own[0], own[1])
-    return _dot_all(residual)
+    return _cost(residual)
 
 
 @inlined
-def _dot_all(residual):
+def _cost(residual):
+    """Return the sum of squared residuals."""
     total = 0.0
     for x in residual:
         total += x * x
@@ -614,7 +620,7 @@ def _sweep(parts, centres, direction, step, nodes, coarse, least):
             if part.kind == 0:
                 continue
             near = math.inf
-            first = centres[g, 0, 0], centres[g, 0, 1], centres[g, 0, 2]
+            first = scale(centres[g, 0], 1.0)
             own = 0
             for k in range(steps):
                 for s in range(spheres):
