@@ -7,6 +7,7 @@ unknowns (3 f coordinates, then p tensions, which `contacts.problem` explains).
 """
 
 import dataclasses
+from typing import TypeGuard
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -26,6 +27,7 @@ from torchgrasp.contacts.problem import (
     triple_mean_jet,
 )
 from torchgrasp.foundation.base import Batch
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.geometry.linalg import dot, matvec, norm
 from torchgrasp.geometry.optim import (
     Damping,
@@ -36,6 +38,8 @@ from torchgrasp.geometry.optim import (
     Verdict,
     levenberg_marquardt,
 )
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.kernel import is_thin
 from torchgrasp.shape.surface import newton_step
 
 # least and greatest damping
@@ -206,7 +210,20 @@ def descend(shape: ShapeLike, problem: ContactProblem, state: State, stage: Stag
 
     `problem` holds the constraints, and `stage` their weights and the number of steps.
     """
+    if not stage.exact and _is_fused(shape, problem, state):
+        from torchgrasp.contacts import fused_descent  # it imports numba
+
+        return fused_descent.descend(shape, problem, state, stage)
     return levenberg_marquardt(Descent(shape, problem, stage), state, stage.steps)[0]
+
+
+def _is_fused(shape: ShapeLike, problem: ContactProblem, state: State) -> TypeGuard[ShapeGP]:
+    """Return whether the compiled loop can compute: with one surface of a thin plate, and without a
+    region or an edge of the table.
+    """
+    if not (type(shape) is ShapeGP and is_fused(state.points, shape.x, shape.weights)):
+        return False
+    return is_thin(shape.kernel) and problem.beyond is None and len(problem.table) < 2
 
 
 def project(shape: ShapeLike, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:

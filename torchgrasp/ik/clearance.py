@@ -7,7 +7,7 @@ Positions [m] are in the object's frame. g counts hands, s their collision spher
 import dataclasses
 import math
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, TypeGuard
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Value, row_numbers, settle
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.plane import Plane, as_plane
@@ -186,6 +187,16 @@ class CollisionWorld(Value):
     def guarded(self) -> bool:
         """Whether there are obstacles, and links must not touch them (`Obstacles.hard`)."""
         return self.obstacles is not None and self.obstacles.hard
+
+
+def is_world_fused(world: CollisionWorld | None, *tensors: Tensor) -> TypeGuard[CollisionWorld]:
+    """Return whether compiled loops can compute in a world: with one object, and a table without
+    edge.
+    """
+    if world is None or not is_fused(*tensors):
+        return False
+    fields = [isinstance(x, SignedDistanceField) and is_fused(x.nodes) for x in world.fields]
+    return all(fields) and (world.plane is None or world.plane.edge is None)
 
 
 def level(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b"]:

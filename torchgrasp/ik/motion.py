@@ -17,7 +17,13 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import CollisionWorld, Obstacles, level, table_clearance
+from torchgrasp.ik.clearance import (
+    CollisionWorld,
+    Obstacles,
+    is_world_fused,
+    level,
+    table_clearance,
+)
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.values.planning import Grasps
 
@@ -155,6 +161,12 @@ def _clearance(
     nearest grid nodes.
     """
     steps = FINE_STEPS if exact else COARSE_STEPS
+    if is_world_fused(world, centres, direction):
+        from torchgrasp.ik import fused_refine  # it imports numba
+
+        step = APPROACH_DISTANCE / steps
+        nodes = MOTION.nodes if exact else 0.0
+        return fused_refine.sweep(centres, radius, direction, world, steps, step, nodes)
     path = _approach(centres, direction, steps).flatten(1, 2)
     radius = radius.repeat(steps)
     least = torch.full_like(path[:, 0, 0], math.inf)

@@ -22,6 +22,7 @@ from torchgrasp.ik.clearance import (
     CollisionWorld,
     away,
     clearance_rows,
+    is_world_fused,
     level,
 )
 from torchgrasp.ik.configuration import Configuration, ResidualRows, SpatialJacobian, differentiate
@@ -105,6 +106,12 @@ def grasp_residuals(
     normals at the contacts, in the object's frame. With `tips_touch` the fingertips may touch the
     object and the table.
     """
+    posture = configuration.joints, configuration.obj_from_hand
+    if is_world_fused(world, *posture, target, normals):
+        from torchgrasp.ik import fused_refine  # it imports numba
+
+        given = target, normals, world, tips_touch, (TIP_WEIGHT, PAD_WEIGHT)
+        return fused_refine.solve(hand, configuration, *given)[1:3]
     spatial = SpatialJacobian.at(hand, configuration)
     links = [] if world is None else clearance_rows(spatial, world, tips_touch)
     return differentiate(spatial, [tip_rows(spatial, target, normals), *links])
@@ -132,6 +139,11 @@ def refine(
         return grasp_residuals(hand, state, target[rows], normals[rows], around, tips_touch=True)
 
     problem = LeastSquares(evaluate, lambda x, step: x.integrate(hand, step), solved, HAND_STEP)
+    if is_world_fused(world, configuration.joints, target):
+        from torchgrasp.ik import fused_refine
+
+        given = target, normals, world, True, (TIP_WEIGHT, PAD_WEIGHT)
+        return fused_refine.solve(hand, configuration, *given, problem, steps)[0]
     return levenberg_marquardt(problem, configuration, steps)[0]
 
 
@@ -166,4 +178,10 @@ def open_hand(
         return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))
 
     problem = LeastSquares(evaluate, integrate, OPENING.solved, HAND_STEP)
+    if is_world_fused(world, grasp.joints, target):
+        from torchgrasp.ik import fused_refine
+
+        given = target, normals, world, False, (TIP_WEIGHT, PAD_WEIGHT)
+        solved = fused_refine.solve(hand, grasp, *given, problem, OPENING.steps, fixed=True)
+        return solved[0].joints
     return levenberg_marquardt(problem, grasp, OPENING.steps)[0].joints

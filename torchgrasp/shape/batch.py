@@ -31,6 +31,7 @@ from torchgrasp.shape.kernel import (
     Queries,
     cross_covariance,
     differentiate_thin_plate,
+    is_thin,
     separations,
     thin_plate,
 )
@@ -204,8 +205,7 @@ class ShapeBatch(Value):
         plate.
         """
         for shape in shapes:
-            form = shape.kernel.closed_form
-            if not (isinstance(form, partial) and form.func is differentiate_thin_plate):
+            if not is_thin(shape.kernel):
                 raise BadArgument("shapes", "a shape with another kernel", "thin-plate kernels")
         outer = [shape.walls[0] for shape in shapes]
         inner = [shape.walls[1] for shape in shapes if len(shape.walls) > 1]

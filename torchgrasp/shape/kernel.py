@@ -204,6 +204,12 @@ def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
     return Kernel(partial(thin_plate, psi=psi), psi / (4.0 / 3.0), remedy, fast)
 
 
+def is_thin(kernel: Kernel) -> bool:
+    """Return whether a kernel is a thin plate in closed form."""
+    form = kernel.closed_form
+    return isinstance(form, partial) and form.func is differentiate_thin_plate
+
+
 def differentiate_thin_plate(
     psi: float | Tensor,
     r: Tensor,

@@ -4,6 +4,7 @@
 
 import dataclasses
 import math
+import types
 from functools import cached_property, partial
 
 import torch
@@ -13,16 +14,12 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value, at_once, in_chunks, kept
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import IndefiniteCovariance
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.foundation.rules import is_known
 from torchgrasp.geometry.linalg import Points, norm
+from torchgrasp.shape import jets
 from torchgrasp.shape.estimate import JointEstimate, MeanAndGradient, MeanJet, Moments, SurfaceJet
-from torchgrasp.shape.jets import (
-    Weighted,
-    distance_rows,
-    evaluate_jet,
-    evaluate_mean,
-    evaluate_mean_jet,
-)
+from torchgrasp.shape.jets import Weighted, distance_rows
 from torchgrasp.shape.kernel import (
     CovarianceRows,
     Kernel,
@@ -31,6 +28,7 @@ from torchgrasp.shape.kernel import (
     differentiate,
     gram,
     is_plain,
+    is_thin,
     separations,
 )
 
@@ -123,7 +121,7 @@ class Posterior(Value):
         """
         if not self._is_plain(x):
             return self.distance_rows(x) @ self.weights
-        mean = partial(evaluate_mean, self.weighted, gradient=False)
+        mean = partial(self._jets(x).evaluate_mean, self.weighted, gradient=False)
         return in_chunks(mean, x, CHUNK.mean)[0]
 
     @checked(gradients=True)
@@ -136,7 +134,7 @@ class Posterior(Value):
         if not self._is_plain(x):
             distance, *slope = (self.cross(x) @ self.weights).unbind(0)
             return distance, torch.stack(slope, -1)
-        mean = partial(evaluate_mean, self.weighted, gradient=True)
+        mean = partial(self._jets(x).evaluate_mean, self.weighted, gradient=True)
         return in_chunks(mean, x, at_once(x, CHUNK.gradient))  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
@@ -195,7 +193,7 @@ class Posterior(Value):
         # gradient of a mean with the weights A k*.
         evaluate = partial(_differentiable_jet, self)
         if self._is_plain(x):
-            evaluate = partial(evaluate_jet, self.weighted, explain=self.explain)
+            evaluate = partial(self._jets(x).evaluate_jet, self.weighted, explain=self.explain)
         return SurfaceJet(*in_chunks(evaluate, x, at_once(x, CHUNK.jet)))
 
     @checked(gradients=True)
@@ -210,7 +208,8 @@ class Posterior(Value):
         size = at_once(x, CHUNK.jet)
         if not self._is_plain(x):
             return MeanJet(*in_chunks(partial(_differentiable_jet, self), x, size)[:3])
-        return MeanJet(*in_chunks(lambda part: evaluate_mean_jet(self.weighted, part)[0], x, size))
+        evaluate = partial(self._jets(x).evaluate_mean_jet, self.weighted)
+        return MeanJet(*in_chunks(lambda part: evaluate(part)[0], x, size))
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
@@ -311,6 +310,14 @@ class Posterior(Value):
     def _is_plain(self, x: Tensor) -> bool:
         """Return whether torch neither differentiates points and posterior nor maps over them."""
         return is_plain(x, self.x, self.weights, self.factor)
+
+    def _jets(self, x: Queries) -> types.ModuleType:
+        """Return the module that evaluates mean and jets at plain points: `jets`, or its loops."""
+        if not (is_fused(x, self.x, self.weights) and is_thin(self.kernel)):
+            return jets
+        from torchgrasp.shape import fused_jets  # it imports numba
+
+        return fused_jets
 
     @property
     def weighted(self) -> Weighted:

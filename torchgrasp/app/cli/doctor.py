@@ -33,6 +33,7 @@ NEEDED_BY = {
     "film": "MP4 files of `torchgrasp film`",
     "mcp": "`torchgrasp mcp`",
     "meshes": "hands with .dae meshes",
+    "fast": "TORCHGRASP_FUSED=1",
     "realsense": "`torchgrasp grasp --realsense`",
     "rerun": "`torchgrasp grasp --rerun`",
     "robots": "hands of robot_descriptions",

@@ -1,0 +1,204 @@
+"""Compiled loops against the operations of torch that define them; without numba the same loops run
+in Python.
+"""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.make import field_of_mesh, run_python, touched_contacts
+from torchgrasp import ContactSpec, PointCloud, load_hand, load_object, plan_grasps
+from torchgrasp.contacts.problem import ContactProblem
+from torchgrasp.contacts.solver import Stage, descend, project, start_state
+from torchgrasp.foundation import fused
+from torchgrasp.foundation.base import named_tensors
+from torchgrasp.foundation.errors import MissingExtra
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
+from torchgrasp.ik.clearance import CollisionWorld, Obstacles
+from torchgrasp.ik.configuration import Configuration
+from torchgrasp.ik.motion import _clearance
+from torchgrasp.ik.refine import grasp_residuals, open_hand, refine
+from torchgrasp.shape.fit import fit_shape
+
+
+def random(*shape: int, seed: int = 0) -> torch.Tensor:
+    """Numbers in [-1, 1]."""
+    generator = torch.Generator().manual_seed(seed)
+    return 2 * torch.rand(*shape, generator=generator, dtype=torch.float64) - 1
+
+
+@pytest.fixture
+def both(monkeypatch):
+    """Make a function's results with operations of torch, then with loops."""
+    monkeypatch.setattr(fused, "has_numba", lambda: True)
+
+    def compute(function):
+        monkeypatch.delenv(fused.VARIABLE, raising=False)
+        first = function()
+        monkeypatch.setenv(fused.VARIABLE, "1")
+        return first, function()
+
+    return compute
+
+
+def assert_close(found, wanted) -> None:
+    """The same to 1e-9 of the largest number."""
+    scale = float(wanted.abs().max())
+    torch.testing.assert_close(found, wanted, rtol=0.0, atol=1e-9 * max(scale, 1e-3))
+
+
+@pytest.fixture(scope="module")
+def shape():
+    """A bowl seen from above, on a table; few points, for loops in Python."""
+    normals = unit(random(120, 3))
+    points = 0.04 * normals + torch.tensor([0.0, 0.0, 0.04])
+    cloud = PointCloud(points, normals)
+    return fit_shape(cloud, table=0.0, budget=40)
+
+
+@pytest.fixture(scope="module", params=["allegro", "barrett"])
+def hand(request):
+    return load_hand(request.param)
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    """A ball, alone, on a table, and beside an obstacle."""
+    import trimesh
+
+    ball = field_of_mesh(trimesh.creation.icosphere(subdivisions=2, radius=0.03))
+    beside = dataclasses.replace(ball, origin=ball.origin + 0.05)
+    other = Obstacles(beside, beside.values[None].float(), torch.tensor([0.5]).double())
+    return (
+        CollisionWorld(ball),
+        CollisionWorld(ball, -0.02),
+        CollisionWorld(ball, -0.02, other),
+        CollisionWorld(None, -0.02),
+    )
+
+
+def postures(hand, n: int) -> Configuration:
+    """Joints within the limits, some with links that collide, near the ball."""
+    share = (random(n, hand.dof) + 1) / 2
+    joints = hand.lower + (hand.upper - hand.lower) * share
+    turn = rotation_from_vector(2 * random(n, 3, seed=1))
+    return Configuration(joints, rigid(turn, 0.08 * random(n, 3, seed=2)))
+
+
+def test_jets_of_a_thin_plate(shape, both):
+    """At its observed points, too, where derivatives are 0 / 0."""
+    x = torch.cat([0.8 * random(6, 3), shape.x[:3]])
+    for function in (shape.mean, shape.mean_and_gradient, shape.mean_jet, shape.jet):
+        wanted, found = both(lambda function=function: function(x))
+        if dataclasses.is_dataclass(wanted):
+            wanted, found = (named_tensors(y).values() for y in (wanted, found))
+        elif isinstance(wanted, torch.Tensor):
+            wanted, found = [wanted], [found]
+        for one, other in zip(found, wanted, strict=True):
+            assert_close(one, other)
+
+
+@pytest.mark.parametrize("tips_touch", [True, False])
+def test_residuals_and_jacobian_of_hands(hand, worlds, both, tips_touch):
+    """The order of clearances is free: what a step is made of is compared."""
+    at = postures(hand, 8)
+    target = at.obj_from_hand[:, None, :3, 3] + 0.05 * random(8, len(hand.tips), 3)
+    normals = unit(random(8, len(hand.tips), 3, seed=3))
+    for world in worlds:
+        (residual, jacobian), (found, by_step) = both(
+            lambda world=world: grasp_residuals(hand, at, target, normals, world, tips_touch)
+        )
+        assert (residual[:, 4 * len(hand.tips) :] > 0).any()
+        assert_close(found.sort(1).values, residual.sort(1).values)
+        assert_close(by_step.mT @ by_step, jacobian.mT @ jacobian)
+        assert_close(by_step.mT @ found[..., None], jacobian.mT @ residual[..., None])
+
+
+def test_refined_and_opened_hands(hand, worlds, both):
+    """Rounding grows with the steps, so that a few are compared."""
+    at = postures(hand, 4)
+    moved = Configuration(at.joints + 0.1 * random(*at.joints.shape), at.obj_from_hand)
+    contacts = touched_contacts(hand, moved.joints, moved.obj_from_hand)
+    for world in worlds[1:]:
+        wanted, found = both(lambda world=world: refine(hand, at, contacts, world, steps=4))
+        assert (wanted.joints - at.joints).abs().max() > 0.01
+        torch.testing.assert_close(found.joints, wanted.joints, rtol=0, atol=1e-7)
+        torch.testing.assert_close(found.obj_from_hand, wanted.obj_from_hand, rtol=0, atol=1e-7)
+        std_m = torch.full_like(contacts.points[..., 0], 1e-3)
+        seen = dataclasses.replace(contacts, std_m=std_m)
+        wanted, found = both(lambda world=world, seen=seen: open_hand(hand, at, seen, world))
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_clearance_on_a_path(worlds, both, exact):
+    centres = 0.1 * random(5, 6, 3)
+    radius = 0.01 + 0.005 * random(6)
+    direction = unit(random(5, 3, seed=4))
+    for world in worlds:
+        wanted, found = both(
+            lambda world=world: _clearance(centres, radius, direction, world, exact)
+        )
+        assert_close(found, wanted)
+
+
+@pytest.mark.parametrize("fingertips", [3, 4])
+@pytest.mark.parametrize("table", [0.0, None])
+def test_a_stage_of_the_contact_solver(shape, both, fingertips, table):
+    """Sets that end, steps that are refused, and contacts outside their bounds are among them."""
+    spec = ContactSpec(table=table, fingertips=fingertips)
+    problem = ContactProblem.of(shape, spec)
+    points = project(shape, 0.5 * unit(random(12, fingertips, 3)), 6)
+    stage = Stage(0.3, 3.0, 4, exact=False)
+    wanted, found = both(lambda: descend(shape, problem, start_state(shape, points), stage))
+    assert (wanted.points - points).abs().max() > 0.01
+    torch.testing.assert_close(found.points, wanted.points, rtol=0, atol=1e-7)
+    torch.testing.assert_close(found.tension, wanted.tension, rtol=1e-6, atol=1e-7)
+    for one, other in zip(
+        named_tensors(found.jet).values(), named_tensors(wanted.jet).values(), strict=True
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
+
+
+def test_plans_with_and_without_loops(both):
+    pytest.importorskip("numba")
+    cloud = load_object("cylinder").view
+    spec = ContactSpec(table=0.0)
+    wanted, found = both(lambda: plan_grasps(cloud, load_hand("allegro"), spec, starts=60))
+    assert torch.equal(found.status, wanted.status)
+    torch.testing.assert_close(found.joints, wanted.joints, rtol=0, atol=1e-4)
+
+
+def test_loops_are_asked_for_and_take_plain_float64_alone(monkeypatch):
+    x = torch.zeros(2, dtype=torch.float64)
+    monkeypatch.delenv(fused.VARIABLE, raising=False)
+    assert not fused.is_fused(x)
+    monkeypatch.setenv(fused.VARIABLE, "1")
+    monkeypatch.setattr(fused, "has_numba", lambda: False)
+    with pytest.raises(MissingExtra, match=r"torchgrasp\[fast\]"):
+        fused.is_fused(x)
+    monkeypatch.setattr(fused, "has_numba", lambda: True)
+    assert fused.is_fused(x)
+    assert not fused.is_fused(x.float())
+    assert not fused.is_fused(x, x.clone().requires_grad_())
+    seen = list[bool]()
+    torch.vmap(lambda y: seen.append(fused.is_fused(y)) or y)(x)
+    assert seen == [False]
+
+
+def test_gradients_go_through_operations_of_torch(shape, monkeypatch):
+    monkeypatch.setenv(fused.VARIABLE, "1")
+    monkeypatch.setattr(fused, "has_numba", lambda: True)
+    x = (0.5 * random(3, 3)).requires_grad_()
+    distance, gradient = shape.mean_and_gradient(x)
+    (slope,) = torch.autograd.grad(distance.sum(), x)
+    torch.testing.assert_close(slope, gradient.detach())
+
+
+def test_an_import_brings_in_no_loops():
+    code = (
+        "import sys, torchgrasp; print(*(x for x in sys.modules if '.fused_' in x or x == 'numba'))"
+    )
+    assert run_python("-c", code).stdout.strip() == ""

@@ -1,0 +1,76 @@
+"""Compiled loops in the place of many small operations of torch, each of which takes a microsecond
+or more however little it computes.
+
+The operations of torch stay the definition: loops compute the same to 1e-9, and only where no
+gradient is needed. They are off unless the environment has `TORCHGRASP_FUSED=1`. numba, of the
+extra `fast`, compiles each loop at its first use, and keeps the result on the disk.
+"""
+
+import functools
+import importlib.util
+import inspect
+import os
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgrasp.foundation.errors import MissingExtra
+from torchgrasp.foundation.rules import is_known, is_tracked
+
+VARIABLE = "TORCHGRASP_FUSED"
+"""Environment variable that asks for compiled loops, by the value 1."""
+REORDERED = {"reassoc", "contract", "nsz"}
+"""What the compiler may change: the order of sums, so that it can use vector instructions."""
+
+
+@functools.cache
+def has_numba() -> bool:
+    """Return whether numba is installed."""
+    return importlib.util.find_spec("numba") is not None
+
+
+def is_fused(*tensors: Tensor) -> bool:
+    """Return whether compiled loops are asked for and can compute with these tensors: float64 on
+    the CPU, which torch neither differentiates nor maps over.
+
+    Raises `MissingExtra` if they are asked for without numba.
+    """
+    if os.environ.get(VARIABLE) != "1":
+        return False
+    if not has_numba():
+        raise MissingExtra("numba", "fast")
+    return all(
+        x.dtype == torch.float64 and x.device.type == "cpu" and is_known(x) and not is_tracked(x)
+        for x in tensors
+    )
+
+
+def compiled(function: Any) -> Any:
+    """Return a function of arrays and numbers as machine code, which is kept on the disk.
+
+    A changed constant of another module goes unnoticed there: pass it as an argument.
+    """
+    return _compile(function, cache=True)
+
+
+def inlined(function: Any) -> Any:
+    """Return a function that compiled ones call; Python cannot."""
+    return _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
+def _compile(function: Any, **options: bool) -> Any:
+    """Return the function itself without numba: the same loops, but slow."""
+    # checks of annotations, as tests add them, can not be compiled
+    plain = inspect.unwrap(function)
+    try:
+        import numba  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return plain
+    return numba.njit(error_model="numpy", fastmath=REORDERED, **options)(plain)
+
+
+def array(x: Tensor, dtype: torch.dtype = torch.float64) -> np.ndarray:
+    """Return a tensor as a contiguous array, which shares its memory if it can."""
+    return np.ascontiguousarray(x.detach().to(dtype).numpy())

@@ -1,0 +1,126 @@
+"""`torchgrasp.shape.jets` as compiled loops, for thin plates.
+
+The functions take the arguments and return the results of those of the same names there.
+"""
+
+import math
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.foundation.fused import array, compiled, inlined
+from torchgrasp.shape.jets import Explain, Weighted, distance_rows
+from torchgrasp.shape.kernel import Queries, separations
+
+Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+"""Observed points (3, n), weights of distances and of normals, and psi."""
+
+
+def evaluate_mean(of: Weighted, x: Queries, gradient: bool) -> tuple[Tensor, ...]:
+    """Return the mean distance (q,) and, if `gradient` is True, its gradient (q, 3)."""
+    found = _mean(of, x, of.a[None], of.b.T[None], bent=False)
+    return found[:2] if gradient else found[:1]
+
+
+def evaluate_mean_jet(of: Weighted, x: Queries) -> tuple[tuple[Tensor, Tensor, Tensor], None]:
+    """Return the fields of `MeanJet`, and None in the place of the kernel's values."""
+    return _mean(of, x, of.a[None], of.b.T[None], bent=True), None
+
+
+def evaluate_jet(of: Weighted, x: Queries, explain: Explain) -> tuple[Tensor, ...]:
+    """Return the fields of `SurfaceJet`."""
+    mean = _mean(of, x, of.a[None], of.b.T[None], bent=True)
+    d, r = separations(x, of.x)
+    k, first = of.kernel.derivatives(r, 2)
+    near = len(of.b)
+    explained, solved = explain(distance_rows(d, k, first, near))
+    n = len(of.x)
+    slope = _mean(of, x, solved[:, :n], solved[:, n:].unflatten(1, (3, near)), bent=False)[1]
+    variance = of.kernel.profile(x.new_zeros(len(x), 1))[:, 0] - explained
+    return *mean, variance, -2.0 * slope
+
+
+def _mean(
+    of: Weighted,
+    x: Queries,
+    a: Float[Tensor, "#q n"],
+    b: Float[Tensor, "#q 3 near"],
+    bent: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return mean (q,), gradient (q, 3) and, if `bent`, Hessian (q, 3, 3) with weights `a` of
+    distances and `b` of normals, the same or others for each point.
+    """
+    found = x.new_empty(len(x)), x.new_empty(len(x), 3), x.new_empty(len(x) * bent, 3, 3)
+    _sum_at(array(x), *_arrays(of, a, b), *(y.numpy() for y in found))
+    return found
+
+
+def arrays_of(of: Weighted) -> Arrays:
+    """Return the arguments of `sum_thin_plate` but the point: y, a, b and psi."""
+    y, a, b, psi = _arrays(of, of.a[None], of.b.T[None])
+    return y, a[0], b[0], psi
+
+
+def _arrays(of: Weighted, a: Tensor, b: Tensor) -> Arrays:
+    shifts = a.new_zeros(len(b), 3, len(of.x))  # points without normals have weight 0
+    shifts[..., : b.shape[2]] = b
+    form = of.kernel.closed_form
+    assert isinstance(form, partial)
+    return array(of.x.T), array(a), array(shifts), float(form.args[0])
+
+
+@inlined
+def sum_thin_plate(x, y, a, b, psi, bent):
+    """Return the sums of `evaluate_mean_jet` at a point x over the n points y (3, n): distance,
+    gradient and, if `bent`, the six numbers xx, yy, zz, xy, xz and yz of the Hessian.
+    """
+    distance = g0 = g1 = g2 = trace = xx = yy = zz = xy = xz = yz = 0.0
+    for j in range(len(a)):
+        d0, d1, d2 = x[0] - y[0, j], x[1] - y[1, j], x[2] - y[2, j]
+        b0, b1, b2 = b[0, j], b[1, j], b[2, j]
+        square = d0 * d0 + d1 * d1 + d2 * d2
+        r = math.sqrt(square)
+        # the kernel and its derivatives by r^2 / 2
+        k = square * (2.0 * r - 3.0 * psi) + psi**3
+        first = 6.0 * (r - psi)
+        second = 6.0 / r if r > 0.0 else 0.0
+        third = -(second**3) / 36.0
+        along = d0 * b0 + d1 * b1 + d2 * b2
+        distance += k * a[j] - first * along
+        c = first * a[j] - second * along
+        g0 += c * d0 - first * b0
+        g1 += c * d1 - first * b1
+        g2 += c * d2 - first * b2
+        if bent:
+            trace += c
+            outer = second * a[j] - third * along
+            s0, s1, s2 = second * b0, second * b1, second * b2
+            xx += (outer * d0 - 2.0 * s0) * d0
+            yy += (outer * d1 - 2.0 * s1) * d1
+            zz += (outer * d2 - 2.0 * s2) * d2
+            xy += (outer * d0 - s0) * d1 - s1 * d0
+            xz += (outer * d0 - s0) * d2 - s2 * d0
+            yz += (outer * d1 - s1) * d2 - s2 * d1
+    return distance, (g0, g1, g2), (xx + trace, yy + trace, zz + trace, xy, xz, yz)
+
+
+@compiled
+def _sum_at(x, y, a, b, psi, distance, gradient, hessian):
+    """Write the sums at each point x (q, 3).
+
+    The weights a (1 or q, n) and b (1 or q, 3, n) are common to all points x or their own.
+    """
+    bent = len(hessian) > 0
+    for i in range(len(x)):
+        own = i if len(a) > 1 else 0
+        distance[i], slope, curved = sum_thin_plate(x[i], y, a[own], b[own], psi, bent)
+        for k in range(3):
+            gradient[i, k] = slope[k]
+            if bent:
+                hessian[i, k, k] = curved[k]
+        if bent:
+            hessian[i, 0, 1] = hessian[i, 1, 0] = curved[3]
+            hessian[i, 0, 2] = hessian[i, 2, 0] = curved[4]
+            hessian[i, 1, 2] = hessian[i, 2, 1] = curved[5]
