@@ -19,4 +19,4 @@ def execute(code: str) -> str:
 
 def run_apart(*codes: str) -> list[str]:
     """Run texts of Python at once, each in a process of its own; return what each says."""
-    return list(run_tasks(execute, [(code,) for code in codes], workers=len(codes), limit=600.0))  # pyright: ignore
+    return list(run_tasks(execute, [(code,) for code in codes], workers=len(codes), limit=600.0))
