@@ -213,11 +213,11 @@ def margin(points: np.ndarray, normals: np.ndarray, friction: float, edges: int)
         one = np.cross(inward, np.eye(3)[np.abs(inward).argmin()])
         one /= np.linalg.norm(one)
         two = np.cross(inward, one)
-        for angle in 2 * np.pi * np.arange(edges) / edges:
-            force = inward + friction * (np.cos(angle) * one + np.sin(angle) * two)
-            columns.append(np.concatenate([force, np.cross(point - centre, force) / radius]))
-    wrenches = np.array(columns).T
-    n = len(columns)
+        angles = 2 * np.pi * np.arange(edges)[:, None] / edges
+        forces = inward + friction * (np.cos(angles) * one + np.sin(angles) * two)
+        columns.append(np.concatenate([forces, np.cross(point - centre, forces) / radius], 1))
+    wrenches = np.concatenate(columns).T
+    n = wrenches.shape[1]
     equal = np.vstack(
         [np.hstack([wrenches, wrenches.sum(1, keepdims=True)]), np.append(np.ones(n), n)]
     )
