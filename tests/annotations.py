@@ -36,7 +36,7 @@ def check_anew() -> None:
 
 def jaxtyped(thing: Any = None, **options: Any) -> Any:
     """Check the annotations of a function or dataclass, as the decorator of jaxtyping does."""
-    if "typechecker" not in options or inspect.isgeneratorfunction(thing):
+    if "typechecker" not in options:
         return by_jaxtyping(thing, **options)
     if thing is None:
         return functools.partial(jaxtyped, **options)
@@ -47,7 +47,25 @@ def jaxtyped(thing: Any = None, **options: Any) -> Any:
         ):
             setattr(thing, "__init__", jaxtyped(thing.__init__, **options))  # noqa: B010
         return thing
+    if inspect.isgeneratorfunction(thing):
+        return first_calls(thing, by_jaxtyping(thing, **options))
     return with_check(thing) if thing.__annotations__ else thing
+
+
+def first_calls(thing: FunctionType, checked: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function whose first calls are those of another, which checks them."""
+    left = LEFT.setdefault(thing.__code__, [CALLS])
+
+    @functools.wraps(thing)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if not left[0]:
+            return thing(*args, **kwargs)
+        if left[0] == CALLS:
+            BEGUN.append(left)
+        left[0] -= 1
+        return checked(*args, **kwargs)
+
+    return call
 
 
 def with_check(thing: FunctionType) -> Callable[..., Any]:

@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.make import run_python
+from tests.apart import run_apart
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.geometry.frames import rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
@@ -132,6 +132,5 @@ def digests_elsewhere(name, simulators, seed):
         "    spec = dataclasses.replace(QUICK, simulator=simulator)\n"
         f"    print(digest(close({name!r}, spec=spec, seed={seed})))"
     )
-    done = run_python("-c", code)
-    assert done.returncode == 0, done.stderr
-    return dict(zip(simulators, done.stdout.split(), strict=True))
+    (said,) = run_apart(code)
+    return dict(zip(simulators, said.split(), strict=True))

@@ -1,8 +1,11 @@
 """The check of annotations that tests add to each function."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
-from jaxtyping import Float
+from beartype import beartype
+from jaxtyping import Float, TypeCheckError
 from torch import Tensor
 
 from tests.annotations import CALLS, check_anew, jaxtyped
@@ -41,19 +44,25 @@ def test_each_call_of_a_nested_function_is_checked():
             call()
 
 
-def test_the_first_calls_of_each_test_are_checked():
+@pytest.mark.parametrize("yields", [False, True])
+def test_the_first_calls_of_each_test_are_checked(yields):
     """However often other tests have called the function; the calls of a test are few."""
 
-    @jaxtyped(typechecker=None)
-    def checked(x: 'Float[Tensor, "n"]') -> Tensor:
-        return x
+    @jaxtyped(typechecker=beartype)
+    def of_one(x: 'Float[Tensor, "n"]') -> list[Tensor]:
+        return [x]
 
+    @jaxtyped(typechecker=beartype)
+    def each_of_one(x: 'Float[Tensor, "n"]') -> Iterator[Tensor]:
+        yield x
+
+    checked = each_of_one if yields else of_one
     for _ in range(CALLS):
-        with pytest.raises(TypeError):
+        with pytest.raises((TypeError, TypeCheckError)):
             checked(torch.zeros(2, 2))
-    assert checked(torch.zeros(2, 2)).shape == (2, 2)
+    assert [x.shape for x in checked(torch.zeros(2, 2))] == [(2, 2)]
     check_anew()  # as conftest.py does before each test
-    with pytest.raises(TypeError):
+    with pytest.raises((TypeError, TypeCheckError)):
         checked(torch.zeros(2, 2))
 
 

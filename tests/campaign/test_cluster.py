@@ -135,7 +135,7 @@ def test_an_object_is_planned_on_and_lifted_by_workers_as_here(
 
 @pytest.mark.filterwarnings("ignore")
 def test_no_scheduler_and_no_dask_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("torchgrasp.campaign.cluster.CONNECTING", "1s")
+    monkeypatch.setattr("torchgrasp.campaign.cluster.CONNECTING", "200ms")
     with pytest.raises(BadArgument, match=r"workers: expected .*got 'tcp://127\.0\.0\.1:1'"):
         list(run_on_cluster(divmod, [(7, 2)], "tcp://127.0.0.1:1", 1.0))
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)

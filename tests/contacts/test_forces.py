@@ -61,8 +61,8 @@ def least_ratio(points, normals):
         for p, n in zip(points, normals, strict=True):
             t = np.linalg.svd(n[None])[2][1:]
             rays = -n + friction * (np.cos(angles)[:, None] * t[0] + np.sin(angles)[:, None] * t[1])
-            columns += [np.concatenate([r, np.cross(p, r)]) for r in rays]
-        matrix = np.stack(columns, 1)
+            columns.append(np.concatenate([rays, np.cross(p, rays)], 1))
+        matrix = np.concatenate(columns).T
         f = len(points)
         ones = np.kron(np.eye(f), np.ones(64))  # normal force of each contact
         scaled = np.concatenate([matrix / 0.04, np.ones((1, 64 * f))])

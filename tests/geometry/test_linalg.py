@@ -126,7 +126,8 @@ def test_rows_are_numbered_as_torch_does_however_large_their_numbers_are(dtype, 
     rows = torch.randint(-3, 3, (200, 3), generator=generator).to(dtype)
     far = torch.tensor([[10**15, -(10**15), 0], [10**15, -(10**15), 1]]).to(dtype)
     rows = torch.cat([rows, far, rows[:5], far])
-    assert torch.equal(number_rows(rows), torch.unique(rows, dim=0, return_inverse=True)[1])
+    for some in (rows, rows[:200]):  # the latter have few numbers
+        assert torch.equal(number_rows(some), torch.unique(some, dim=0, return_inverse=True)[1])
     assert number_rows(rows[:0]).tolist() == []
 
 

@@ -5,8 +5,6 @@ public functions.
 import inspect
 import pickle
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from torch import Tensor
 from torch.autograd import forward_ad, gradcheck, gradgradcheck
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
 
+from tests.apart import run_apart
 from tests.gradients.compare import F64, every, near, scalar, slopes, weighted_sum
 from tests.gradients.table import LAW, MASKS, ROWS, Function, Row, draw, outputs, page
 from tests.hostile.arguments import checked_things, required
@@ -220,11 +219,11 @@ def test_compiled_rows_are_the_same(request: pytest.FixtureRequest):
     names = [name for name in names if not any(part in name for part in alike)]
     if request.config.getoption("--hypothesis-profile") != "long":
         names = [name for name in names if name.endswith(COMPILED)]
-    code = f"from tests.gradients.compare import compile_rows; compile_rows({names})"
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code], cwd=ROOT, capture_output=True, text=True
+    code = "import warnings; warnings.simplefilter('ignore'); "
+    (said,) = run_apart(
+        code + f"from tests.gradients.compare import compile_rows; compile_rows({names})"
     )
-    assert done.stdout.split() == names, done.stderr[-3000:]
+    assert said.split() == names
 
 
 def test_the_table_has_public_functions_alone():

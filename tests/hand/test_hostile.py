@@ -7,9 +7,7 @@ the hand's folder is opened, nothing is run, and little is allocated.
 
 import json
 import pickle
-import subprocess
 import sys
-import textwrap
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.apart import run_apart
 from torchgrasp import load_mixture
 from torchgrasp.app.author.draft import draft_hand, new_hand
 from torchgrasp.foundation.errors import GraspError, HandFileError, ModelFileError
@@ -220,10 +219,10 @@ print(json.dumps({"outcomes": found, "seen": seen[:20]}))
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits are set as on Linux")
 def test_hostile_hands_are_refused_and_open_nothing(claw, tmp_path):
     (claw.parent / "hand.toml").write_text(draft_hand(claw))
-    command = [sys.executable, "-c", textwrap.dedent(WATCHED), __file__, str(claw.parent)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr[-2000:]
-    said = json.loads(done.stdout.splitlines()[-1])
+    words = [__file__, str(claw.parent)]
+    begin = f"import os, sys; os.chdir({str(tmp_path)!r}); sys.argv[1:] = {words!r}"
+    (told,) = run_apart(begin + WATCHED)
+    said = json.loads(told.splitlines()[-1])
     assert len(said["outcomes"]) >= 60
     # what is only seen is not read; a joint without limits is repaired
     harmless = {f"claw.urdf: seen {name[:30]!r}" for name in NAMES} | {"new: continuous joint"}

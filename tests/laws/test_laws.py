@@ -10,7 +10,8 @@ import torch
 import trimesh
 from scipy.optimize import linprog
 
-from tests.make import ball_contacts, load_hand, run_python
+from tests.apart import run_apart
+from tests.make import ball_contacts, load_hand
 from torchgrasp import (
     ContactSpec,
     Plane,
@@ -131,8 +132,7 @@ def test_the_same_seed_gives_the_same_grasps_in_another_process_and_with_two_thr
     tmp_path,
 ):
     paths = [tmp_path / "one", tmp_path / "two", tmp_path / "here"]
-    ended = run_python("-c", GRASP.format([str(path) for path in paths[:2]]))
-    assert ended.returncode == 0, ended.stderr
+    run_apart(GRASP.format([str(path) for path in paths[:2]]))
     plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=20, seed=3).save(
         paths[2]
     )
@@ -213,11 +213,11 @@ def margin(points: np.ndarray, normals: np.ndarray, friction: float, edges: int)
         one = np.cross(inward, np.eye(3)[np.abs(inward).argmin()])
         one /= np.linalg.norm(one)
         two = np.cross(inward, one)
-        for angle in 2 * np.pi * np.arange(edges) / edges:
-            force = inward + friction * (np.cos(angle) * one + np.sin(angle) * two)
-            columns.append(np.concatenate([force, np.cross(point - centre, force) / radius]))
-    wrenches = np.array(columns).T
-    n = len(columns)
+        angles = 2 * np.pi * np.arange(edges)[:, None] / edges
+        forces = inward + friction * (np.cos(angles) * one + np.sin(angles) * two)
+        columns.append(np.concatenate([forces, np.cross(point - centre, forces) / radius], 1))
+    wrenches = np.concatenate(columns).T
+    n = wrenches.shape[1]
     equal = np.vstack(
         [np.hstack([wrenches, wrenches.sum(1, keepdims=True)]), np.append(np.ones(n), n)]
     )

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.apart import run_apart
 from tests.make import ring_samples as ring
-from tests.make import run_python
 from torchgrasp import GraspMixture, load_mixture
 from torchgrasp.files import load_tensors
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, OutputError
@@ -94,26 +94,28 @@ def test_the_checkpoint_of_another_fit_a_damaged_one_and_bad_folders_are_refused
         fit_mixture(samples, 5, iterations=2, checkpoint=tmp_path / "mixture.safetensors" / "below")
 
 
-def test_two_processes_fit_what_one_does(tmp_path):
-    script = tmp_path / "share.py"
-    script.write_text(f"""
+SHARE = """
 import torch
-from tests.make import ring_samples as ring
+from torchgrasp.posture_model.sample import HandSamples
 from torchgrasp.posture_model.training import fit_mixture
-torch.distributed.init_process_group("gloo")
-rank = torch.distributed.get_rank()
-share = ring()[:1100] if rank == 0 else ring()[1100:]  # unequal shares
-path = {str(tmp_path)!r}
-mixture = fit_mixture(share, 5, seed=3, iterations=25, tolerance=0.0, distributed=True, checkpoint=path + "/fit")
-mixture.save(path + f"/{{rank}}.safetensors")
-parts = fit_mixture(share, 5, seed=3, iterations=60, distributed=True, subset=400, starts=2)
-parts.save(path + f"/parts{{rank}}.safetensors")
+torch.distributed.init_process_group(
+    "gloo", init_method="file://" + {folder!r} + "/meet", rank={rank}, world_size=2
+)
+samples = HandSamples(*torch.load({folder!r} + "/ring.pt"), ("turn",))
+share = samples[:1100] if {rank} == 0 else samples[1100:]  # unequal shares
+mixture = fit_mixture(
+    share, 5, 3, 25, tolerance=0.0, distributed=True, checkpoint={folder!r} + "/fit"
+)
+mixture.save({folder!r} + "/{rank}.safetensors")
+parts = fit_mixture(share, 5, 3, 60, distributed=True, subset=400, starts=2)
+parts.save({folder!r} + "/parts{rank}.safetensors")
 torch.distributed.destroy_process_group()
-""")
-    done = run_python(
-        "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)
-    )
-    assert done.returncode == 0, done.stderr
+"""
+
+
+def test_two_processes_fit_what_one_does(tmp_path):
+    torch.save((ring().joints, ring().q), tmp_path / "ring.pt")
+    run_apart(*(SHARE.format(folder=str(tmp_path), rank=rank) for rank in (0, 1)))
     first, second = (load_mixture(tmp_path / f"{rank}.safetensors") for rank in (0, 1))
     assert torch.equal(parameters(first), parameters(second))
     one = fit_mixture(ring(), 5, seed=3, iterations=25, tolerance=0.0)

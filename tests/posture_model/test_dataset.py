@@ -6,8 +6,7 @@ import json
 import os
 import resource
 import signal
-import subprocess
-import sys
+import threading
 import time
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from torchgrasp import load_hand, sample_configurations
 from torchgrasp.app.cli import main
 from torchgrasp.files import hold_folder
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, OutputError
-from torchgrasp.posture_model import SampleSpec, load_samples, write_samples
+from torchgrasp.posture_model import SampleSpec, dataset, load_samples, write_samples
 
 
 @pytest.fixture
@@ -78,28 +77,28 @@ def test_a_folder_serves_a_loader_posture_by_posture(tmp_path, small):
         samples["joints"]
 
 
-HELD_RUN = """
-import signal, sys, threading
-from torchgrasp.app.cli import main
-from torchgrasp.posture_model import dataset, sample
+def start_held(arguments: list[str], held: int) -> int:
+    """Return the number of a child that runs a command and waits before a chunk of number `held`."""
+    if child := os.fork():
+        return child
+    interrupted = threading.Event()
 
-interrupted = threading.Event()
+    def interrupt(*_: object) -> None:
+        interrupted.set()
+        raise KeyboardInterrupt
 
-def interrupt(*_):
-    interrupted.set()
-    raise KeyboardInterrupt
+    def draw_the_first(hand, spec, i, draw=dataset.draw_chunk):
+        if i >= held:  # the run cannot end before it is interrupted, whatever the machine does
+            interrupted.wait()
+        return draw(hand, spec, i)
 
-def draw_the_first(hand, spec, i, draw=dataset.draw_chunk):
-    if i >= {held}:  # the run cannot end before it is interrupted, whatever the machine does meanwhile
-        interrupted.wait()
-    return draw(hand, spec, i)
-
-signal.signal(signal.SIGINT, interrupt)
-sample.CHUNK_POSTURES = dataset.CHUNK_POSTURES = 500
-sample.BLOCK_POSTURES = 250
-dataset.draw_chunk = draw_the_first
-sys.exit(main({arguments!r}))
-"""
+    code = 70  # of a command that raises
+    try:
+        signal.signal(signal.SIGINT, interrupt)
+        dataset.draw_chunk = draw_the_first
+        code = main(arguments)
+    finally:
+        os._exit(code)
 
 
 @pytest.mark.promise("F1")
@@ -121,13 +120,12 @@ def test_a_run_that_was_interrupted_and_killed_is_continued_to_the_same_bytes(tm
     ]
     for sign, expected, held in ((signal.SIGINT, 130, 2), (signal.SIGKILL, -signal.SIGKILL, 5)):
         before = {path: path.stat().st_mtime_ns for path in folder.glob("chunk-*")}
-        run = subprocess.Popen(
-            [sys.executable, "-c", HELD_RUN.format(held=held, arguments=arguments)]
-        )
-        while run.poll() is None and len(list(folder.glob("chunk-*"))) < held:
+        run = start_held(arguments, held)
+        while len(list(folder.glob("chunk-*"))) < held:
+            assert os.waitpid(run, os.WNOHANG) == (0, 0)
             time.sleep(0.01)
-        os.kill(run.pid, sign)
-        assert run.wait() == expected
+        os.kill(run, sign)
+        assert os.waitstatus_to_exitcode(os.waitpid(run, 0)[1]) == expected
         assert len(before) < held <= len(list(folder.glob("chunk-*"))) < 7
         assert all(
             path.stat().st_mtime_ns == then for path, then in before.items()

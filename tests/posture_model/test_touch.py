@@ -56,16 +56,14 @@ def closes(points: np.ndarray, inward: np.ndarray, friction: float, edges: int =
     which sum to 1.
     """
     columns = []
-    normal = []
     for point, n in zip(points - points.mean(0), inward, strict=True):
         first = np.cross(n, np.eye(3)[np.abs(n).argmin()])
         first /= np.linalg.norm(first)
         second = np.cross(n, first)
-        for turn in 2 * np.pi * np.arange(edges) / edges:
-            force = n + friction * (np.cos(turn) * first + np.sin(turn) * second)
-            columns.append(np.concatenate([force, np.cross(point, force) / 0.05]))
-        normal.append(len(columns))
-    a = np.array(columns).T
+        turns = 2 * np.pi * np.arange(edges)[:, None] / edges
+        forces = n + friction * (np.cos(turns) * first + np.sin(turns) * second)
+        columns.append(np.concatenate([forces, np.cross(point, forces) / 0.05], 1))
+    a = np.concatenate(columns).T
     sums = np.zeros((3, a.shape[1]))
     for k in range(3):
         sums[k, k * edges : (k + 1) * edges] = 1

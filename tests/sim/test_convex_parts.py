@@ -112,9 +112,9 @@ def test_bodies_that_overlap_keep_their_size_and_voids_are_not_filled(tmp_path):
     both = bar + other
     corners = np.concatenate([part.vertices for part in convex_parts(both, tmp_path)])
     assert np.abs(np.stack([corners.min(0), corners.max(0)]) - both.bounds).max() < 1e-6
-    void = trimesh.creation.box((0.06, 0.06, 0.06))
+    void = trimesh.creation.box((0.08, 0.02, 0.02))
     void.invert()
-    hollow = trimesh.creation.box((0.1, 0.1, 0.1)) + void
+    hollow = trimesh.creation.box((0.1, 0.03, 0.03)) + void
     assert not any(part.contains([[0.0, 0.0, 0.0]])[0] for part in convex_parts(hollow, tmp_path))
 
 

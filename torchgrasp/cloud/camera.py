@@ -166,12 +166,12 @@ def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Imag
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
     mesh = with_true_normals(mesh)
-    row, column = _pixels()
+    row, column = (torch.arange(n).double() for n in (HEIGHT, WIDTH))
     x = (column - INTRINSICS[0, 2]) / FOCAL
     y = (row - INTRINSICS[1, 2]) / FOCAL
-    rays = torch.stack([x, y, torch.ones_like(x)], -1)
-    inside = _in_image_box(mesh, obj_from_camera, x, y)
-    direction = rotate(obj_from_camera, rays[inside]).numpy()
+    inside = torch.nonzero(_in_image_box(mesh, obj_from_camera, x, y))
+    rays = torch.stack([x[inside[:, 1]], y[inside[:, 0]], torch.ones(len(inside)).double()], -1)
+    direction = rotate(obj_from_camera, rays).numpy()
     origin = obj_from_camera[:3, 3].numpy()
     face = np.asarray(
         mesh.ray.intersects_first(np.broadcast_to(origin, direction.shape), direction)
@@ -183,7 +183,7 @@ def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Imag
     against = (normal * direction[hit]).sum(-1)
     z = ((corner - origin) * normal).sum(-1) / against
     cosine = np.abs(against) / np.linalg.norm(direction[hit], axis=-1)
-    where = torch.nonzero(inside)[torch.from_numpy(hit)]
+    where = inside[torch.from_numpy(hit)]
     images = torch.zeros(2, HEIGHT, WIDTH, dtype=torch.float64)
     images[:, where[:, 0], where[:, 1]] = torch.from_numpy(np.stack([z, cosine]))
     return images[0], images[1]
@@ -197,19 +197,23 @@ def _pixels() -> tuple[Image, Image]:
 
 
 def _in_image_box(
-    mesh: "trimesh.Trimesh", obj_from_camera: Transform, x: Image, y: Image
+    mesh: "trimesh.Trimesh",
+    obj_from_camera: Transform,
+    x: Float[Tensor, "w"],
+    y: Float[Tensor, "h"],
 ) -> Bool[Tensor, "h w"]:
     """Return a mask of the camera rays (x, y, 1) that pass through the bounding box of the mesh in
-    the image.
+    the image; `x` are those of its columns, and `y` of its rows.
     """
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)
     if float(depth.min()) <= RENDER.nearest:
-        return torch.ones_like(x, dtype=torch.bool)
+        return torch.ones(len(y), len(x), dtype=torch.bool)
     u = u / depth
     v = v / depth
     wide = (x >= u.min() - RENDER.margin) & (x <= u.max() + RENDER.margin)
-    return wide & (y >= v.min() - RENDER.margin) & (y <= v.max() + RENDER.margin)
+    high = (y >= v.min() - RENDER.margin) & (y <= v.max() + RENDER.margin)
+    return high[:, None] & wide
 
 
 def render_depth(

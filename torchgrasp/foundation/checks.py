@@ -18,7 +18,7 @@ import typing
 from collections.abc import Callable, Iterator
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, overload
+from typing import Annotated, Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 import torch
@@ -40,8 +40,10 @@ from torchgrasp.foundation.rules import (
     Taken,
     check_dense,
     check_path,
+    check_plain,
     describe,
     fits,
+    fits_plain,
     is_known,
     is_rigid,
     is_tensor,
@@ -74,6 +76,12 @@ class _Call:
     sizes: dict[str, Any] = dataclasses.field(default_factory=dict[str, Any])
     finite: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
     rigid: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
+
+    def inner(self, **changed: Any) -> "_Call":
+        """Return the state for a part of an argument; `changed` fields are its own."""
+        new = object.__new__(_Call)  # faster than dataclasses.replace
+        new.__dict__ |= self.__dict__ | changed
+        return new
 
     def check_numbers(self) -> None:
         """Raise `BadArgument` if a tensor in `finite` has NaN or infinity, or one in `rigid` is no
@@ -124,11 +132,7 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
     """
     signature = inspect.signature(function)
     is_method = next(iter(signature.parameters), "") == "self" and not isinstance(owner, type)
-    several = {
-        p.name: p.kind
-        for p in signature.parameters.values()
-        if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
-    }
+    bind = _Binding.of(signature)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -150,24 +154,32 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
             return run(args, kwargs, inside)
 
     def run(args: tuple[Any, ...], kwargs: dict[str, Any], inside: bool) -> Any:
-        _check_options(signature, kwargs, owner)
-        bound = signature.bind(*args, **kwargs)
+        if not bind.all_known(kwargs):
+            _check_options(signature, kwargs, owner)
+        arguments = bind(args, kwargs)
         shared = _Call(gradients, deep=not inside)
         hints = _hints(owner)
         if is_method:
-            shared.sizes.update(_lengths(bound.arguments["self"]))
-        for name, value in bound.arguments.items():
-            if several.get(name) == inspect.Parameter.VAR_KEYWORD and name in hints:
-                bound.arguments[name] = {
-                    k: _read(k, x, _option(hints[name], k), shared) for k, x in value.items()
+            shared.sizes.update(_lengths(arguments["self"]))
+        for name, value in arguments.items():
+            if name not in hints:
+                continue
+            hint = hints[name]
+            if name == bind.options:
+                arguments[name] = {
+                    k: _read(k, x, _option(hint, k), shared) for k, x in value.items()
                 }
-            elif name in hints:
-                hint = tuple[hints[name], ...] if name in several else hints[name]
-                bound.arguments[name] = _read(name, value, hint, shared)
+            elif name == bind.rest:
+                arguments[name] = tuple(
+                    _read(f"{name}[{i}]", x, hint, shared) for i, x in enumerate(value)
+                )
+            else:
+                arguments[name] = _read(name, value, hint, shared)
         shared.check_numbers()
+        args, kwargs = bind.split(arguments, len(args))
         _thread.inside = True
         try:
-            result = function(*bound.args, **bound.kwargs)
+            result = function(*args, **kwargs)
         finally:
             _thread.inside = inside
         if not inside and inspect.isgenerator(result):
@@ -176,6 +188,96 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
 
     setattr(call, "__checked__", True)  # noqa: B010
     return call
+
+
+@dataclasses.dataclass(frozen=True)
+class _Binding:
+    """How arguments are bound to the parameters of a function, faster than by its signature.
+
+    Args:
+        signature: the signature, which binds what has no simple form.
+        names: all parameters in order.
+        positional: those that take a place.
+        required: those without a default.
+        rest: name of the parameter that takes all other places; empty if there is none.
+        options: name of the parameter that takes all other keywords; empty if there is none.
+    """
+
+    signature: inspect.Signature
+    names: tuple[str, ...]
+    positional: tuple[str, ...]
+    required: frozenset[str]
+    rest: str
+    options: str
+
+    @staticmethod
+    def of(signature: inspect.Signature) -> "_Binding":
+        """Return the binding of a signature."""
+        kinds = {p.name: p.kind for p in signature.parameters.values()}
+        places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        several = {kind: name for name, kind in kinds.items()}
+        return _Binding(
+            signature,
+            tuple(kinds),
+            tuple(name for name, kind in kinds.items() if kind in places),
+            frozenset(p.name for p in signature.parameters.values() if p.default is p.empty),
+            several.get(inspect.Parameter.VAR_POSITIONAL, ""),
+            several.get(inspect.Parameter.VAR_KEYWORD, ""),
+        )
+
+    def all_known(self, kwargs: dict[str, Any]) -> bool:
+        """Return whether there is a parameter for each keyword."""
+        return bool(self.options) or kwargs.keys() <= self.signature.parameters.keys()
+
+    def __call__(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
+        """Return the arguments by the names of the parameters, in their order; raise `TypeError` as
+        a call does.
+        """
+        given = dict(zip(self.positional, args, strict=False)) | kwargs
+        simple = not self.rest and not self.options and len(given) == len(args) + len(kwargs)
+        if not simple or not self.required <= given.keys():
+            return self.signature.bind(*args, **kwargs).arguments
+        return {name: given[name] for name in self.names if name in given}
+
+    def split(
+        self, arguments: dict[str, Any], count: int
+    ) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """Return the arguments of a call, `count` of them by place, and the others by keyword."""
+        if self.rest or self.options:
+            bound = inspect.BoundArguments(self.signature, arguments)  # pyright: ignore[reportArgumentType]
+            return bound.args, bound.kwargs
+        places = self.positional[:count]
+        rest = {name: x for name, x in arguments.items() if name not in places}
+        return tuple(arguments[name] for name in places), rest
+
+
+class _Form(NamedTuple):
+    """What is read of an annotation once: its type with brackets or None, the types in the brackets,
+    and what kind of annotation it is.
+    """
+
+    hint: Any
+    origin: Any
+    inside: tuple[Any, ...]
+    is_number: bool
+    is_tensor: bool
+    is_container: bool
+
+
+_forms = dict[int, _Form]()
+"""Forms by the `id` of the annotation, which each of them keeps."""
+
+
+def _form(hint: Any) -> _Form:
+    """Return what is read of an annotation."""
+    found = _forms.get(id(hint))
+    if found is None:
+        origin = typing.get_origin(hint)
+        container = isinstance(origin, type) and origin not in (type, collections.abc.Callable)
+        number = hint in (int, float, bool)
+        found = _Form(hint, origin, typing.get_args(hint), number, is_tensor(hint), container)
+        _forms[id(hint)] = found
+    return found
 
 
 @contextlib.contextmanager
@@ -194,17 +296,16 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
     """Return an argument if it satisfies its annotation, a number as a Python number; else raise
     `BadArgument`.
     """
-    origin = typing.get_origin(hint)
-    inside = typing.get_args(hint)
+    _, origin, inside, is_number, of_tensor, is_container = _form(hint)
+    if of_tensor:
+        return _read_tensor(name, value, hint, call)
     if origin is Annotated:
         return _read_marked(name, value, inside[0], inside[1], call)
     if origin in (typing.Union, types.UnionType):
         return _read_union(name, value, hint, inside, call)
-    if hint in (int, float, bool):
+    if is_number:
         return read_number(name, value, hint, NUMBERS.get(hint))
-    if is_tensor(hint):
-        return _read_tensor(name, value, hint, call)
-    if isinstance(origin, type) and origin not in (type, collections.abc.Callable):
+    if is_container:
         return _read_container(name, value, origin, inside, call)
     if not is_bearable(value, hint):
         raise BadArgument(name, show(value), describe(hint))
@@ -213,7 +314,7 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
     elif isinstance(value, Tensor) and hint not in (object, Any):
         check_dense(name, value, call.gradients)
     elif call.deep and hasattr(type(value), "__checked__") and dataclasses.is_dataclass(value):
-        inner = dataclasses.replace(call, sizes={})  # the letters of a value are its own
+        inner = call.inner(sizes={})  # the letters of a value are its own
         for field, of_field in _fields(type(value)).items():
             _read(f"{name}.{field}", getattr(value, field), of_field, inner)
     elif call.deep and not call.gradients and dataclasses.is_dataclass(value):
@@ -266,8 +367,8 @@ def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> An
     if mark == ANY and hint is float and isinstance(value, float):
         return value
     if mark == ANY and not call.strict:
-        call = dataclasses.replace(call, finite={})
-    inner = dataclasses.replace(call, strict=True) if mark == FINITE else call
+        call = call.inner(finite={})
+    inner = call.inner(strict=True) if mark == FINITE else call
     result = _read(name, value, hint, inner)
     if mark == RIGID:
         call.rigid[name] = result
@@ -306,13 +407,16 @@ def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
     """Return a tensor if it has the annotated shape and dtype; record the sizes of the axes that
     are letters.
     """
-    axes = hint.dim_str.split()
+    axes, plain, kind, dtypes = _shape(hint)
     sizes = dict(call.sizes)
-    kind = hint.dtype.__name__
     if not isinstance(value, Tensor):
         raise BadArgument(name, show(value), f"a torch {describe(hint)[2:]}")
     check_dense(name, value, gradients=True)
-    if not fits(axes, tuple(value.shape), sizes):
+    if plain is None:
+        good = fits(axes, tuple(value.shape), sizes)
+    else:
+        good = fits_plain(plain, value.shape, sizes)
+    if not good:
         known = [
             f"{axis} = {call.sizes[axis]}" for axis in dict.fromkeys(axes) if axis in call.sizes
         ]
@@ -320,16 +424,31 @@ def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
             [describe(hint).removeprefix("a tensor of ") if axes else "shape ()", *known]
         )
         raise BadArgument(name, f"shape {tuple(value.shape)}", allowed)
-    if value.dtype not in (dtypes := DTYPES.get(kind) or sum(DTYPES.values(), ())):
+    if value.dtype not in dtypes:
         raise BadArgument(name, str(value.dtype), " or ".join(map(str, dtypes)))
     if not call.gradients:
-        check_dense(name, value, gradients=False)
+        check_plain(name, value)
     call.sizes.update(sizes)
     if value.is_inference():  # torch refuses it where derivatives are taken
         value = value.clone()
     if kind == "Float":
         call.finite[name] = value
     return value
+
+
+@functools.cache
+def _shape(
+    hint: Any,
+) -> tuple[list[str], tuple[int | str, ...] | None, str, tuple[torch.dtype, ...]]:
+    """Return the axes of an annotated tensor, the same for `fits_plain` or None, the name of its
+    kind, and the dtypes of that kind.
+    """
+    axes = hint.dim_str.split()
+    plain = None
+    if not any(axis[0] in "*.#" for axis in axes):
+        plain = tuple(int(axis) if axis.isdigit() else axis for axis in axes)
+    kind = hint.dtype.__name__
+    return axes, plain, kind, DTYPES.get(kind) or sum(DTYPES.values(), ())
 
 
 def _read_container(
@@ -387,20 +506,23 @@ def _lengths(value: Any) -> dict[str, int]:
     """Return the size of each letter in the annotated shapes of a value's tensors, such as {"n":
     100}.
     """
-    tensors = {
-        field: hint.dim_str.split()
-        for field, hint in _fields(type(value)).items()
-        if is_tensor(hint)
-    }
-    simple = {
-        field: axes for field, axes in tensors.items() if not any(axis[0] in "*.#" for axis in axes)
-    }
     pairs = (
         pair
-        for field, axes in simple.items()
+        for field, axes in _simple_axes(type(value)).items()
         for pair in zip(axes, getattr(value, field).shape, strict=False)
     )
     return {axis: n for axis, n in pairs if axis.isalpha()}
+
+
+@functools.cache
+def _simple_axes(kind: type) -> dict[str, list[str]]:
+    """Return the annotated axes of each field that is a tensor with a fixed number of axes."""
+    tensors = {
+        field: hint.dim_str.split() for field, hint in _fields(kind).items() if is_tensor(hint)
+    }
+    return {
+        field: axes for field, axes in tensors.items() if not any(axis[0] in "*.#" for axis in axes)
+    }
 
 
 @functools.cache
@@ -414,9 +536,6 @@ def _check_options(signature: inspect.Signature, given: dict[str, Any], owner: A
 
     It names the nearest argument, or the argument whose value has a field of this name.
     """
-    kinds = {one.kind for one in signature.parameters.values()}
-    if inspect.Parameter.VAR_KEYWORD in kinds:
-        return
     for name in given.keys() - signature.parameters.keys():
         known = [option for option in signature.parameters if option != "self"]
         sentence = f"expected one of {', '.join(known)}{_hint(name, signature, owner)}"

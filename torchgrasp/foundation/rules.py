@@ -171,6 +171,18 @@ def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool
     return True
 
 
+def fits_plain(axes: tuple[int | str, ...], shape: torch.Size, sizes: dict[str, Any]) -> bool:
+    """Return the same as `fits` for axes that are numbers, letters and "_" alone."""
+    if len(axes) != len(shape):
+        return False
+    for axis, n in zip(axes, shape, strict=True):
+        if axis == n or axis == "_":
+            continue
+        if isinstance(axis, int) or sizes.setdefault(axis, n) != n:
+            return False
+    return True
+
+
 def check_dense(name: str, value: Tensor, gradients: bool) -> None:
     """Raise `BadArgument` if the tensor `value` is sparse, nested or meta, or has the negative bit.
 
@@ -184,11 +196,21 @@ def check_dense(name: str, value: Tensor, gradients: bool) -> None:
         raise BadArgument(
             name, "a tensor with the negative bit", f"one without: {name}.resolve_neg()"
         )
-    if not gradients and is_tracked(value):
+    if not gradients:
+        check_plain(name, value)
+
+
+def check_plain(name: str, value: Tensor) -> None:
+    """Raise `BadArgument` if a tensor requires a gradient or is inside torch.vmap; errors call it
+    by `name`.
+    """
+    if not functorch.is_functorch_wrapped_tensor(value) and not is_tracked(value):
+        return
+    if is_tracked(value):
         raise BadArgument(
             name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()"
         )
-    if not gradients and any(map(functorch.is_batchedtensor, _levels(value))):
+    if any(map(functorch.is_batchedtensor, _levels(value))):
         raise BadArgument(
             name, "a tensor inside torch.vmap", "a plain tensor: the function is not differentiable"
         )
@@ -208,8 +230,9 @@ def is_tracked(value: Tensor) -> bool:
     """Return whether torch computes derivatives with respect to a tensor: by autograd, in forward
     mode, or by torch.func.
     """
-    levels = _levels(value)
-    if any(x.requires_grad or functorch.is_gradtrackingtensor(x) for x in levels):
+    if not functorch.is_functorch_wrapped_tensor(value):
+        return value.requires_grad or forward_ad.unpack_dual(value).tangent is not None
+    if any(x.requires_grad or functorch.is_gradtrackingtensor(x) for x in _levels(value)):
         return True
     return (
         not functorch.is_batchedtensor(value) and forward_ad.unpack_dual(value).tangent is not None
@@ -220,9 +243,10 @@ def is_known(value: Tensor) -> bool:
     """Return whether Python may test the numbers of a tensor; inside torch.vmap or torch.compile it
     may not.
     """
-    return not (
-        torch.compiler.is_compiling() or any(map(functorch.is_batchedtensor, _levels(value)))
-    )
+    if torch.compiler.is_compiling():
+        return False
+    wrapped = functorch.is_functorch_wrapped_tensor(value)
+    return not (wrapped and any(map(functorch.is_batchedtensor, _levels(value))))
 
 
 def show(value: Any) -> str:

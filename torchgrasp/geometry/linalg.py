@@ -100,6 +100,13 @@ def number_rows(rows: Shaped[Tensor, "n d"]) -> Int[Tensor, "n"]:
     `torch.unique` of whole rows takes much longer than that of one column after the other.
     """
     number = torch.zeros(len(rows), dtype=torch.int64, device=rows.device)
+    if len(rows) and rows.dtype == torch.int64:
+        ends = torch.stack(rows.aminmax(dim=0)).tolist()  # as whole numbers of any size
+        sizes = [most - least + 1 for least, most in zip(*ends, strict=True)]
+        if math.prod(sizes) <= torch.iinfo(torch.int64).max:  # one number tells each row
+            for column, size in zip((rows - rows.amin(0)).T, sizes, strict=True):
+                number = number * size + column
+            return number.unique(return_inverse=True)[1]
     for column in rows.T:
         values, place = column.unique(return_inverse=True)
         pair = number * len(values) + place

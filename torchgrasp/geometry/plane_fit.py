@@ -6,11 +6,11 @@ import dataclasses
 import math
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.foundation.base import row_numbers
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, Vector, norm, number_rows, unit
 
@@ -306,9 +306,10 @@ def _held(
     else 0.
     """
     held = torch.empty(len(normals), len(points), dtype=torch.float32, device="cpu")
-    for rows in row_numbers(normals).split(PLANES.at_once):
-        height = normals[rows] @ points.T - offsets[rows, None]
-        held[rows] = (height.abs_() < 2 * noise).float()
+    parts = (x.split(PLANES.at_once) for x in (held, normals, offsets[:, None]))
+    for part, normal, offset in zip(*parts, strict=True):
+        height = (normal @ points.T).sub_(offset)
+        torch.lt(height.abs_(), 2 * noise, out=part)
     return held
 
 
@@ -318,15 +319,17 @@ def refine_plane(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) ->
     """
     points = view.points
     noise = view.noise
+    variance = noise.square()
     scale = 1.0
     for _ in range(PLANES.steps):
         ratio = (points @ normal - offset) / noise
-        core = ratio.abs() < PLANES.core * scale
-        if bool(core.any()):
-            measured = float(PLANES.per_quantile * ratio[core].abs().quantile(PLANES.quantile))
+        size = ratio.abs()
+        core = size[size < PLANES.core * scale]
+        if len(core):
+            measured = float(PLANES.per_quantile * _quantile(core, PLANES.quantile))
             scale = min(max(measured, PLANES.smooth), PLANES.rough)
         share = (ratio / (PLANES.tukey * scale)).square()
-        weight = (1 - share).clamp_min(0).square() / noise.square()
+        weight = (1 - share).clamp_min(0).square() / variance
         weight = weight / weight.sum()
         mean = weight @ points
         offset_points = points - mean
@@ -341,3 +344,13 @@ def refine_plane(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) ->
             break
     on = ((points @ normal - offset).abs() / noise) < PLANES.core * scale
     return PlaneFit(normal, offset, scale, int(on.sum()))
+
+
+def _quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
+    """Return what `torch.quantile` does, but for rounding; it sorts all n numbers, which takes much
+    longer.
+    """
+    rank = share * (len(values) - 1)
+    ends = [math.floor(rank), math.ceil(rank)]
+    below, above = torch.from_numpy(np.partition(values.numpy(), ends)[ends])
+    return torch.lerp(below, above, rank - ends[0])

@@ -57,7 +57,7 @@ def attempt(view, shelf, protocol, spec, row, draw):
         pass
     return ProtocolResult(row, draw, True, Status.OK)
 
-campaign._plan, campaign._try, campaign.TRIAL_LIMIT = plan, attempt, 2.0
+campaign._plan, campaign._try, campaign.TRIAL_LIMIT = plan, attempt, 0.5
 
 if __name__ == "__main__":
     from torchgrasp.app import cli
