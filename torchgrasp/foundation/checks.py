@@ -132,7 +132,9 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
     """
     signature = inspect.signature(function)
     is_method = next(iter(signature.parameters), "") == "self" and not isinstance(owner, type)
-    bind = _Binding.of(signature)
+    several = {p.kind: p.name for p in signature.parameters.values()}
+    rest = several.get(inspect.Parameter.VAR_POSITIONAL)
+    options = several.get(inspect.Parameter.VAR_KEYWORD)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -154,9 +156,10 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
             return run(args, kwargs, inside)
 
     def run(args: tuple[Any, ...], kwargs: dict[str, Any], inside: bool) -> Any:
-        if not bind.all_known(kwargs):
+        if options is None and not kwargs.keys() <= signature.parameters.keys():
             _check_options(signature, kwargs, owner)
-        arguments = bind(args, kwargs)
+        bound = signature.bind(*args, **kwargs)
+        arguments = bound.arguments
         shared = _Call(gradients, deep=not inside)
         hints = _hints(owner)
         if is_method:
@@ -165,21 +168,20 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
             if name not in hints:
                 continue
             hint = hints[name]
-            if name == bind.options:
+            if name == options:
                 arguments[name] = {
                     k: _read(k, x, _option(hint, k), shared) for k, x in value.items()
                 }
-            elif name == bind.rest:
+            elif name == rest:
                 arguments[name] = tuple(
                     _read(f"{name}[{i}]", x, hint, shared) for i, x in enumerate(value)
                 )
             else:
                 arguments[name] = _read(name, value, hint, shared)
         shared.check_numbers()
-        args, kwargs = bind.split(arguments, len(args))
         _thread.inside = True
         try:
-            result = function(*args, **kwargs)
+            result = function(*bound.args, **bound.kwargs)
         finally:
             _thread.inside = inside
         if not inside and inspect.isgenerator(result):
@@ -188,67 +190,6 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
 
     setattr(call, "__checked__", True)  # noqa: B010
     return call
-
-
-@dataclasses.dataclass(frozen=True)
-class _Binding:
-    """How arguments are bound to the parameters of a function, faster than by its signature.
-
-    Args:
-        signature: the signature, which binds what has no simple form.
-        names: all parameters in order.
-        positional: those that take a place.
-        required: those without a default.
-        rest: name of the parameter that takes all other places; empty if there is none.
-        options: name of the parameter that takes all other keywords; empty if there is none.
-    """
-
-    signature: inspect.Signature
-    names: tuple[str, ...]
-    positional: tuple[str, ...]
-    required: frozenset[str]
-    rest: str
-    options: str
-
-    @staticmethod
-    def of(signature: inspect.Signature) -> "_Binding":
-        """Return the binding of a signature."""
-        kinds = {p.name: p.kind for p in signature.parameters.values()}
-        places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        several = {kind: name for name, kind in kinds.items()}
-        return _Binding(
-            signature,
-            tuple(kinds),
-            tuple(name for name, kind in kinds.items() if kind in places),
-            frozenset(p.name for p in signature.parameters.values() if p.default is p.empty),
-            several.get(inspect.Parameter.VAR_POSITIONAL, ""),
-            several.get(inspect.Parameter.VAR_KEYWORD, ""),
-        )
-
-    def all_known(self, kwargs: dict[str, Any]) -> bool:
-        """Return whether there is a parameter for each keyword."""
-        return bool(self.options) or kwargs.keys() <= self.signature.parameters.keys()
-
-    def __call__(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
-        """Return the arguments by the names of the parameters, in their order; raise `TypeError` as
-        a call does.
-        """
-        given = dict(zip(self.positional, args, strict=False)) | kwargs
-        simple = not self.rest and not self.options and len(given) == len(args) + len(kwargs)
-        if not simple or not self.required <= given.keys():
-            return self.signature.bind(*args, **kwargs).arguments
-        return {name: given[name] for name in self.names if name in given}
-
-    def split(
-        self, arguments: dict[str, Any], count: int
-    ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        """Return the arguments of a call, `count` of them by place, and the others by keyword."""
-        if self.rest or self.options:
-            bound = inspect.BoundArguments(self.signature, arguments)  # pyright: ignore[reportArgumentType]
-            return bound.args, bound.kwargs
-        places = self.positional[:count]
-        rest = {name: x for name, x in arguments.items() if name not in places}
-        return tuple(arguments[name] for name in places), rest
 
 
 class _Form(NamedTuple):
