@@ -7,7 +7,7 @@
 
 * gpu: clouds, launches: many clouds at once, also without a GPU
 
-* plan: pace, uncertain: time to grasps, uncertain friction
+* plan: pace: time to grasps
 
 * scene: real, rooms, target: supports and things in depth images, a given thing among others
 

@@ -189,15 +189,6 @@ def keep(path: Path, make: Callable[[], Any]) -> Any:
     return json.loads(path.read_text("utf-8"))
 
 
-def keep_at_commit(options: Options, name: str) -> Path | None:
-    """Return the folder in `out` for results of a bench that hold at this commit alone.
-
-    None while the working tree has changes, or without git: then nothing is kept.
-    """
-    commit = describe_commit()
-    return options.out / name / commit if is_fixed(commit) else None
-
-
 def is_fixed(commit: str) -> bool:
     """Return whether the text on a commit names one, without changes of the working tree."""
     return CHANGED not in commit and UNKNOWN not in commit
