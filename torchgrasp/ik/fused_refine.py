@@ -396,13 +396,12 @@ def _step(n, damping, residual, jacobian, matrix, x):
     x[:] = 0.0
     fixed = jacobian.shape[1] - d
     for k in range(len(residual)):
-        if residual[k] != 0.0:
-            row = jacobian[k, fixed:]
-            for i in range(d):
-                if row[i] != 0.0:
-                    x[i] -= row[i] * residual[k]
-                    for j in range(i + 1):
-                        matrix[i, j] += row[i] * row[j]
+        row = jacobian[k, fixed:]
+        for i in range(d):
+            if row[i] != 0.0:
+                x[i] -= row[i] * residual[k]
+                for j in range(i + 1):
+                    matrix[i, j] += row[i] * row[j]
     for i in range(d):
         matrix[i, i] += damping * matrix[i, i] + n.floor
     if not factorise(matrix):
@@ -605,8 +604,8 @@ def _parts(
     plane = world.plane
     if plane is None:
         return (*parts, WorldPart(0, none, none, size, 0.0, none))
-    # contacts tell how low tips are
-    grown = array(CLEARANCE * touching - radius)
+    # contacts tell how low tips are; a bool times a number would be a float32
+    grown = array(CLEARANCE * touching.to(radius) - radius)
     return (*parts, WorldPart(1, none, array(plane.normal), size, float(plane.offset), grown))
 
 
