@@ -3,12 +3,23 @@ in Python.
 """
 
 import dataclasses
+import importlib
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 
 from tests.make import field_of_mesh, run_python, touched_contacts
-from torchgrasp import Contacts, ContactSpec, PointCloud, load_hand, load_object, plan_grasps
+from torchgrasp import (
+    Contacts,
+    ContactSpec,
+    PointCloud,
+    load_hand,
+    load_object,
+    plan_grasps,
+    stream_grasps,
+)
 from torchgrasp.contacts.problem import ContactProblem
 from torchgrasp.contacts.solver import Stage, descend, project, start_state
 from torchgrasp.foundation import fused
@@ -191,6 +202,8 @@ def test_loops_are_asked_for_and_take_plain_float64_alone(monkeypatch):
     monkeypatch.setattr(fused, "has_numba", lambda: False)
     with pytest.raises(MissingExtra, match=r"torchgrasp\[fast\]"):
         fused.is_fused(x)
+    with pytest.raises(MissingExtra):  # at the call, before any work
+        stream_grasps(load_object("cylinder").view, load_hand("allegro"))
     monkeypatch.setattr(fused, "has_numba", lambda: True)
     assert fused.is_fused(x)
     assert not fused.is_fused(x.float())
@@ -214,3 +227,40 @@ def test_an_import_brings_in_no_loops():
         "import sys, torchgrasp; print(*(x for x in sys.modules if '.fused_' in x or x == 'numba'))"
     )
     assert run_python("-c", code).stdout.strip() == ""
+
+
+def import_file(path: Path):
+    """The module of a file, as a new process finds it."""
+    sys.modules.pop(path.stem, None)
+    importlib.invalidate_caches()
+    return importlib.import_module(path.stem)
+
+
+def test_changed_loops_are_compiled_anew(tmp_path, monkeypatch):
+    """Also those of another file, as after an upgrade."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    inner, outer = tmp_path / "inner_loop.py", tmp_path / "outer_loop.py"
+    head = "from torchgrasp.foundation.fused import compiled, inlined\n"
+    text = "from inner_loop import f\n@compiled\ndef g(x):\n    return 2.0 * f(x)\n"
+    outer.write_text(head + text)
+    for k in (1.0, 3.0):
+        inner.write_text(f"{head}@inlined\ndef f(x):\n    return x + {k}\n")
+        import_file(inner)
+        assert import_file(outer).g(1.0) == 2 + 2 * k
+
+
+def test_a_numba_that_cannot_be_imported_is_no_numba_that_is_missing(tmp_path, monkeypatch):
+    """Loops in Python would be slow without a word."""
+    monkeypatch.delitem(sys.modules, "numba", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "numba.py").write_text("raise ImportError('numba needs another numpy')")
+    with pytest.raises(ImportError, match="another numpy"):
+        fused.inlined(both)
+
+
+def test_loops_need_no_folder_for_machine_code():
+    """A function that is in no file has none."""
+    names = {}
+    exec("def double(x):\n    return 2.0 * x", names)
+    assert fused.compiled(names["double"])(3.0) == 6
