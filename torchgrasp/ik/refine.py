@@ -111,7 +111,7 @@ def grasp_residuals(
         from torchgrasp.ik import fused_refine  # it imports numba
 
         given = target, normals, world, tips_touch, (TIP_WEIGHT, PAD_WEIGHT)
-        return fused_refine.solve(hand, configuration, *given)[1:3]
+        return fused_refine.solve(hand, configuration, *given)[1:]
     spatial = SpatialJacobian.at(hand, configuration)
     links = [] if world is None else clearance_rows(spatial, world, tips_touch)
     return differentiate(spatial, [tip_rows(spatial, target, normals), *links])
