@@ -389,19 +389,21 @@ def _cost(residual):
 
 
 @inlined
-def _step(n, damping, residual, jacobian, matrix, x):
+def _step(n, damping, tips, residual, jacobian, matrix, x):
     """Write the damped step, as `LeastSquares.step`; it is zero where the matrix is singular."""
     d = len(x)
     matrix[:] = 0.0
     x[:] = 0.0
     fixed = jacobian.shape[1] - d
     for k in range(len(residual)):
-        row = jacobian[k, fixed:]
-        for i in range(d):
-            if row[i] != 0.0:
-                x[i] -= row[i] * residual[k]
-                for j in range(i + 1):
-                    matrix[i, j] += row[i] * row[j]
+        # a bound that holds has no row, but a tip that is in its place has
+        if k < 3 * tips or residual[k] != 0.0:
+            row = jacobian[k, fixed:]
+            for i in range(d):
+                if row[i] != 0.0:
+                    x[i] -= row[i] * residual[k]
+                    for j in range(i + 1):
+                        matrix[i, j] += row[i] * row[j]
     for i in range(d):
         matrix[i, i] += damping * matrix[i, i] + n.floor
     if not factorise(matrix):
@@ -467,7 +469,7 @@ def _solve(h, parts, n, joints, poses, target, normals, residual, jacobian):
         for _ in range(n.steps):
             if cost < n.solved or damping == math.inf:
                 break
-            _step(n, damping, residual[g], jacobian[g], matrix, x)
+            _step(n, damping, len(h.tip_link), residual[g], jacobian[g], matrix, x)
             _move(h, joints[g], poses[g], x, new_joints, new_pose)
             new = _evaluate(h, parts, n, new_joints, new_pose, *own, trial[0], trial[1])
             if new < cost:
