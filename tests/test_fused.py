@@ -264,3 +264,19 @@ def test_loops_need_no_folder_for_machine_code():
     names = {}
     exec("def double(x):\n    return 2.0 * x", names)
     assert fused.compiled(names["double"])(3.0) == 6
+
+
+def test_a_process_that_compiles_has_the_bits_of_one_that_loads(tmp_path, monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv(fused.VARIABLE, "1")
+    code = """if True:
+        from tests.test_fused import *
+        shape = fit_shape(load_object("jug").view, table=0.0)
+        points = project(shape, 0.5 * unit(random(50, 3, 3)), 6)
+        problem = ContactProblem.of(shape, ContactSpec(table=0.0))
+        state = start_state(shape, points)
+        print(descend(shape, problem, state, Stage(0.0, 3.0, 30, exact=False)).points.tolist())
+    """
+    first, second = (run_python("-c", code).stdout for _ in range(2))
+    assert first == second != ""

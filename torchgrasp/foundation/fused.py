@@ -65,7 +65,9 @@ def compiled(function: Any) -> Any:
 
 def inlined(function: Any) -> Any:
     """Return a function that compiled ones call; Python cannot."""
-    return _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    # a call would find one of several copies, of other bits in a process that has just compiled
+    options = dict(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    return _compile(function, **options)
 
 
 def _compile(function: Any, **options: bool) -> Any:
