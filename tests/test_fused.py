@@ -3,12 +3,23 @@ in Python.
 """
 
 import dataclasses
+import importlib
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 
 from tests.make import field_of_mesh, run_python, touched_contacts
-from torchgrasp import ContactSpec, PointCloud, load_hand, load_object, plan_grasps
+from torchgrasp import (
+    Contacts,
+    ContactSpec,
+    PointCloud,
+    load_hand,
+    load_object,
+    plan_grasps,
+    stream_grasps,
+)
 from torchgrasp.contacts.problem import ContactProblem
 from torchgrasp.contacts.solver import Stage, descend, project, start_state
 from torchgrasp.foundation import fused
@@ -17,7 +28,7 @@ from torchgrasp.foundation.errors import MissingExtra
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
-from torchgrasp.ik.configuration import Configuration
+from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.motion import _clearance
 from torchgrasp.ik.refine import grasp_residuals, open_hand, refine
 from torchgrasp.shape.fit import fit_shape
@@ -43,10 +54,10 @@ def both(monkeypatch):
     return compute
 
 
-def assert_close(found, wanted) -> None:
-    """The same to 1e-9 of the largest number."""
+def assert_close(found, wanted, rounding: float = 1e-9) -> None:
+    """The same to a part of the largest number."""
     scale = float(wanted.abs().max())
-    torch.testing.assert_close(found, wanted, rtol=0.0, atol=1e-9 * max(scale, 1e-3))
+    torch.testing.assert_close(found, wanted, rtol=0.0, atol=rounding * max(scale, 1e-3))
 
 
 @pytest.fixture(scope="module")
@@ -111,9 +122,9 @@ def test_residuals_and_jacobian_of_hands(hand, worlds, both, tips_touch):
             lambda world=world: grasp_residuals(hand, at, target, normals, world, tips_touch)
         )
         assert (residual[:, 4 * len(hand.tips) :] > 0).any()
-        assert_close(found.sort(1).values, residual.sort(1).values)
-        assert_close(by_step.mT @ by_step, jacobian.mT @ jacobian)
-        assert_close(by_step.mT @ found[..., None], jacobian.mT @ residual[..., None])
+        assert_close(found.sort(1).values, residual.sort(1).values, 1e-13)
+        assert_close(by_step.mT @ by_step, jacobian.mT @ jacobian, 1e-13)
+        assert_close(by_step.mT @ found[..., None], jacobian.mT @ residual[..., None], 1e-13)
 
 
 def test_refined_and_opened_hands(hand, worlds, both):
@@ -130,6 +141,18 @@ def test_refined_and_opened_hands(hand, worlds, both):
         seen = dataclasses.replace(contacts, std_m=std_m)
         wanted, found = both(lambda world=world, seen=seen: open_hand(hand, at, seen, world))
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_a_residual_of_zero_holds_its_direction(hand, both, tracked):
+    """Targets are right above the tips. A pose that requires a gradient gets none."""
+    at = postures(hand, 4)
+    centres = SpatialJacobian.at(hand, at).tips.permute(2, 1, 0)
+    up = torch.tensor([0.0, 0.0, 1.0]).double().expand_as(centres)
+    contacts = Contacts(centres - hand.tip_radius[:, None] * up + 0.01 * up, up)
+    at.obj_from_hand.requires_grad_(tracked)
+    wanted, found = both(lambda: refine(hand, at, contacts, CollisionWorld(), steps=1))
+    torch.testing.assert_close(found.joints, wanted.joints, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("exact", [True, False])
@@ -179,6 +202,8 @@ def test_loops_are_asked_for_and_take_plain_float64_alone(monkeypatch):
     monkeypatch.setattr(fused, "has_numba", lambda: False)
     with pytest.raises(MissingExtra, match=r"torchgrasp\[fast\]"):
         fused.is_fused(x)
+    with pytest.raises(MissingExtra):  # at the call, before any work
+        stream_grasps(load_object("cylinder").view, load_hand("allegro"))
     monkeypatch.setattr(fused, "has_numba", lambda: True)
     assert fused.is_fused(x)
     assert not fused.is_fused(x.float())
@@ -202,3 +227,56 @@ def test_an_import_brings_in_no_loops():
         "import sys, torchgrasp; print(*(x for x in sys.modules if '.fused_' in x or x == 'numba'))"
     )
     assert run_python("-c", code).stdout.strip() == ""
+
+
+def import_file(path: Path):
+    """The module of a file, as a new process finds it."""
+    sys.modules.pop(path.stem, None)
+    importlib.invalidate_caches()
+    return importlib.import_module(path.stem)
+
+
+def test_changed_loops_are_compiled_anew(tmp_path, monkeypatch):
+    """Also those of another file, as after an upgrade."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    inner, outer = tmp_path / "inner_loop.py", tmp_path / "outer_loop.py"
+    head = "from torchgrasp.foundation.fused import compiled, inlined\n"
+    text = "from inner_loop import f\n@compiled\ndef g(x):\n    return 2.0 * f(x)\n"
+    outer.write_text(head + text)
+    for k in (1.0, 3.0):
+        inner.write_text(f"{head}@inlined\ndef f(x):\n    return x + {k}\n")
+        import_file(inner)
+        assert import_file(outer).g(1.0) == 2 + 2 * k
+
+
+def test_a_numba_that_cannot_be_imported_is_no_numba_that_is_missing(tmp_path, monkeypatch):
+    """Loops in Python would be slow without a word."""
+    monkeypatch.delitem(sys.modules, "numba", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "numba.py").write_text("raise ImportError('numba needs another numpy')")
+    with pytest.raises(ImportError, match="another numpy"):
+        fused.inlined(both)
+
+
+def test_loops_need_no_folder_for_machine_code():
+    """A function that is in no file has none."""
+    names = {}
+    exec("def double(x):\n    return 2.0 * x", names)
+    assert fused.compiled(names["double"])(3.0) == 6
+
+
+def test_a_process_that_compiles_has_the_bits_of_one_that_loads(tmp_path, monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv(fused.VARIABLE, "1")
+    code = """if True:
+        from tests.test_fused import *
+        shape = fit_shape(load_object("jug").view, table=0.0)
+        points = project(shape, 0.5 * unit(random(50, 3, 3)), 6)
+        problem = ContactProblem.of(shape, ContactSpec(table=0.0))
+        state = start_state(shape, points)
+        print(descend(shape, problem, state, Stage(0.0, 3.0, 30, exact=False)).points.tolist())
+    """
+    first, second = (run_python("-c", code).stdout for _ in range(2))
+    assert first == second != ""

@@ -25,7 +25,7 @@ from torchgrasp.geometry.fused_vectors import (
     solve_factorised,
 )
 from torchgrasp.shape.estimate import SurfaceJet
-from torchgrasp.shape.fused_jets import arrays_of, sum_thin_plate
+from torchgrasp.shape.fused_jets import arrays_of, put_hessian, sum_thin_plate
 from torchgrasp.shape.gp import ShapeGP
 
 NUMBERS = (
@@ -173,11 +173,7 @@ def _move(n, thin, pairs, signs, old, x, new):
         put(points[i], add(points[i], newton, short))
         distance[i], slope, curved = sum_thin_plate(points[i], y, a, b, psi, True)
         put(gradient[i], slope)
-        for k in range(3):
-            hessian[i, k, k] = curved[k]
-        hessian[i, 0, 1] = hessian[i, 1, 0] = curved[3]
-        hessian[i, 0, 2] = hessian[i, 2, 0] = curved[4]
-        hessian[i, 1, 2] = hessian[i, 2, 1] = curved[5]
+        put_hessian(hessian[i], curved)
         variance[i] = old[5][i] + dot(old[6][i], add(points[i], old[0][i], -1.0))
     for k in range(len(tension)):
         tension[k] = old[1][k] + x[3 * f + k]

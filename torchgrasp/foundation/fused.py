@@ -7,6 +7,7 @@ extra `fast`, compiles each loop at its first use, and keeps the result on the d
 """
 
 import functools
+import hashlib
 import importlib.util
 import inspect
 import os
@@ -50,14 +51,23 @@ def is_fused(*tensors: Tensor) -> bool:
 def compiled(function: Any) -> Any:
     """Return a function of arrays and numbers as machine code, which is kept on the disk.
 
-    A changed constant of another module goes unnoticed there: pass it as an argument.
+    Where no folder can be written, each process compiles it. A changed constant of a module goes
+    unnoticed there: pass it as an argument.
     """
-    return _compile(function, cache=True)
+    # numba names files by this, and would miss a change of what the function calls
+    digest = hashlib.sha256(_content(inspect.unwrap(function)) + repr(sorted(REORDERED)).encode())
+    inspect.unwrap(function).__qualname__ += f"_{digest.hexdigest()[:8]}"
+    try:
+        return _compile(function, cache=True)
+    except RuntimeError:  # no folder
+        return _compile(function)
 
 
 def inlined(function: Any) -> Any:
     """Return a function that compiled ones call; Python cannot."""
-    return _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    # a call would find one of several copies, of other bits in a process that has just compiled
+    options = dict(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    return _compile(function, **options)
 
 
 def _compile(function: Any, **options: bool) -> Any:
@@ -66,9 +76,17 @@ def _compile(function: Any, **options: bool) -> Any:
     plain = inspect.unwrap(function)
     try:
         import numba  # pyright: ignore[reportMissingImports]
-    except ImportError:
+    except ModuleNotFoundError:
         return plain
     return numba.njit(error_model="numpy", fastmath=REORDERED, **options)(plain)
+
+
+def _content(function: Any) -> bytes:
+    """Return the bytecode of a function and of all inlined ones that it calls."""
+    code = function.__code__
+    called = [function.__globals__.get(name) for name in code.co_names]
+    own = code.co_code + repr((code.co_consts, code.co_names)).encode()
+    return own + b"".join(_content(x.py_func) for x in called if hasattr(x, "py_func"))
 
 
 def array(x: Tensor, dtype: torch.dtype = torch.float64) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""The refinement of hand configurations (`torchgrasp.ik.refine`) as one compiled loop over hands.
+"""The refinement of hand configurations (`torchgrasp.ik.refine`) as one compiled loop over hands,
+and the clearance on their paths (`torchgrasp.ik.motion`) as another.
 
-The loop computes residuals and Jacobian of `grasp_residuals`, and the steps of
-`levenberg_marquardt` with `LeastSquares`. It takes float64 on the CPU, and a world of one object
+The first computes residuals and Jacobian of `grasp_residuals`, and the steps of
+`levenberg_marquardt` with `LeastSquares`. They take float64 on the CPU, and a world of one object
 whose table has no edge. Vectors are tuples of three numbers, or rows of arrays. l counts links, m
 residuals, d the numbers of a step.
 """
@@ -337,7 +338,7 @@ def _clear(h, n, part, spheres, twists, order, index, residual, jacobian):
 @inlined
 def _evaluate(h, parts, n, joints, pose, target, normals, room, residual, jacobian):
     """Write the residuals of a hand and their Jacobian, as `grasp_residuals`; return their cost."""
-    frames, spheres, twists, pads, axes, centers, order, index = room
+    frames, spheres, twists, axes, centers, order, index = room
     residual[:] = 0.0
     jacobian[:] = 0.0
     _place_links(h, joints, pose, frames)
@@ -347,13 +348,12 @@ def _evaluate(h, parts, n, joints, pose, target, normals, room, residual, jacobi
         put(twists[q, 1], turning)
         sliding = _turn(frame, h.sliding[q])
         put(twists[q, 0], add(cross(frame[3], turning), sliding, 1.0))
-    tips = len(pads)
+    tips = len(h.tip_link)
     for f in range(tips):
         frame = frames[h.tip_link[f]]
         moves = h.moves[h.tip_link[f]]
         center = _place(frame, h.tip_center[f])
         pad = _turn(frame, h.tip_normal[f])
-        put(pads[f], pad)
         for k in range(3):
             row = 3 * f + k
             residual[row] = n.tip * (center[k] - target[f, k])
@@ -389,14 +389,15 @@ def _cost(residual):
 
 
 @inlined
-def _step(n, damping, residual, jacobian, matrix, x):
+def _step(n, damping, tips, residual, jacobian, matrix, x):
     """Write the damped step, as `LeastSquares.step`; it is zero where the matrix is singular."""
     d = len(x)
     matrix[:] = 0.0
     x[:] = 0.0
     fixed = jacobian.shape[1] - d
     for k in range(len(residual)):
-        if residual[k] != 0.0:
+        # a bound that holds has no row, but a tip that is in its place has
+        if k < 3 * tips or residual[k] != 0.0:
             row = jacobian[k, fixed:]
             for i in range(d):
                 if row[i] != 0.0:
@@ -440,9 +441,9 @@ def _move(h, joints, pose, x, new_joints, new_pose):
 
 
 @compiled
-def _solve(h, parts, n, joints, poses, target, normals, residual, jacobian, pads):
+def _solve(h, parts, n, joints, poses, target, normals, residual, jacobian):
     """Refine configurations in place, as `levenberg_marquardt` with `LeastSquares`, and write their
-    residuals, Jacobians and pads.
+    residuals and Jacobians.
     """
     links = len(h.joint)
     d = jacobian.shape[2]
@@ -456,7 +457,6 @@ def _solve(h, parts, n, joints, poses, target, normals, residual, jacobian, pads
         np.empty((links, 4, 3)),
         np.empty((len(h.sphere_link), 3)),
         np.empty((len(h.motion_link), 2, 3)),
-        np.empty((len(h.tip_link), 3)),
         np.empty((shapes, 3, 3)),
         np.empty((shapes, 3)),
         np.empty(hinges),
@@ -465,12 +465,11 @@ def _solve(h, parts, n, joints, poses, target, normals, residual, jacobian, pads
     for g in range(len(joints)):
         own = (target[g], normals[g], room)
         cost = _evaluate(h, parts, n, joints[g], poses[g], *own, residual[g], jacobian[g])
-        copy(pads[g], room[3])
         damping = n.first
         for _ in range(n.steps):
             if cost < n.solved or damping == math.inf:
                 break
-            _step(n, damping, residual[g], jacobian[g], matrix, x)
+            _step(n, damping, len(h.tip_link), residual[g], jacobian[g], matrix, x)
             _move(h, joints[g], poses[g], x, new_joints, new_pose)
             new = _evaluate(h, parts, n, new_joints, new_pose, *own, trial[0], trial[1])
             if new < cost:
@@ -498,10 +497,8 @@ def solve(
     problem: LeastSquares | None = None,
     steps: int = 0,
     fixed: bool = False,
-) -> tuple[Configuration, Tensor, Tensor, Tensor]:
-    """Return configurations after at most `steps` steps, and at the first ones the residuals, their
-    Jacobian and the normals of pads.
-    """
+) -> tuple[Configuration, Tensor, Tensor]:
+    """Return configurations after at most `steps` steps, and their residuals and Jacobian."""
     tables = hand.derived.get(HandTables) or hand.derived.setdefault(HandTables, _tables(hand))
     spheres = hand.collision_spheres
     parts = _parts(spheres.radius, spheres.touching & tips_touch, world)
@@ -513,9 +510,8 @@ def solve(
     poses = configuration.obj_from_hand.clone(memory_format=torch.contiguous_format)
     residual = target.new_empty(g, rows)
     jacobian = target.new_empty(g, rows, 6 + hand.dof)
-    pads = target.new_empty(g, len(hand.tips), 3)
-    names = ("first_damping", *SolverNumbers._fields[11:])
-    solver = [getattr(problem or LeastSquares, name) for name in names]
+    names = SolverNumbers._fields[SolverNumbers._fields.index("solved") :]
+    solver = [getattr(problem or LeastSquares, name) for name in ("first_damping", *names)]
     numbers = SolverNumbers(
         weights[0] / MILLIMETRE,
         weights[1],
@@ -529,18 +525,9 @@ def solve(
         0 if fixed else 6,
         *map(float, solver),
     )
-    changed = (x.numpy() for x in (residual, jacobian, pads))
-    _solve(
-        tables,
-        parts,
-        numbers,
-        joints.numpy(),
-        poses.numpy(),
-        array(target),
-        array(normals),
-        *changed,
-    )
-    return Configuration(joints, poses), residual, jacobian, pads
+    given = joints.numpy(), poses.numpy(), array(target), array(normals)
+    _solve(tables, parts, numbers, *given, residual.numpy(), jacobian.numpy())
+    return Configuration(joints, poses), residual, jacobian
 
 
 def _tables(hand: Hand) -> HandTables:
@@ -605,8 +592,8 @@ def _parts(
     plane = world.plane
     if plane is None:
         return (*parts, WorldPart(0, none, none, size, 0.0, none))
-    # contacts tell how low tips are
-    grown = array(CLEARANCE * touching - radius)
+    # contacts tell how low tips are; a bool times a number would be a float32
+    grown = array(CLEARANCE * touching.to(radius) - radius)
     return (*parts, WorldPart(1, none, array(plane.normal), size, float(plane.offset), grown))
 
 

@@ -111,7 +111,7 @@ def grasp_residuals(
         from torchgrasp.ik import fused_refine  # it imports numba
 
         given = target, normals, world, tips_touch, (TIP_WEIGHT, PAD_WEIGHT)
-        return fused_refine.solve(hand, configuration, *given)[1:3]
+        return fused_refine.solve(hand, configuration, *given)[1:]
     spatial = SpatialJacobian.at(hand, configuration)
     links = [] if world is None else clearance_rows(spatial, world, tips_touch)
     return differentiate(spatial, [tip_rows(spatial, target, normals), *links])
@@ -139,7 +139,7 @@ def refine(
         return grasp_residuals(hand, state, target[rows], normals[rows], around, tips_touch=True)
 
     problem = LeastSquares(evaluate, lambda x, step: x.integrate(hand, step), solved, HAND_STEP)
-    if is_world_fused(world, configuration.joints, target):
+    if is_world_fused(world, configuration.joints, configuration.obj_from_hand, target):
         from torchgrasp.ik import fused_refine
 
         given = target, normals, world, True, (TIP_WEIGHT, PAD_WEIGHT)
@@ -178,7 +178,7 @@ def open_hand(
         return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))
 
     problem = LeastSquares(evaluate, integrate, OPENING.solved, HAND_STEP)
-    if is_world_fused(world, grasp.joints, target):
+    if is_world_fused(world, grasp.joints, grasp.obj_from_hand, target):
         from torchgrasp.ik import fused_refine
 
         given = target, normals, world, False, (TIP_WEIGHT, PAD_WEIGHT)

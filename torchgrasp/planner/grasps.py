@@ -151,7 +151,7 @@ def plan_grasps(
             or more than 2 m below the object's top; a scene without a target; `keep` off the
             object; an `arm` of another hand; a `promise` for a displaced object; `shape`, `arm`,
             `observer`, `reachable` or a region beside several clouds; a bad file of cloud or hand.
-        MissingExtra, NoWorkers: pebble is not installed, or no worker process can start.
+        MissingExtra, NoWorkers: pebble or numba is not installed, or no worker process can start.
 
     If cloud, camera and table are moved together, the grasps move with them. In a scene the hand
     keeps clear of the target's neighbours and of space that is probably full. What risk remains

@@ -11,6 +11,7 @@ from torchgrasp.cloud.agreement import check_where
 from torchgrasp.contacts.region import Region, combine
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
@@ -89,8 +90,10 @@ class Request:
         These are an arm of another hand, no load to resist, and a box or mesh to keep to off the
         object. A `promise` (the share of returned grasps that hold) contradicts a displaced object.
         The warning `NoEffect` tells of a box or mesh that changes nothing. One to avoid is off the
-        object, or one to keep to holds all of it.
+        object, or one to keep to holds all of it. Raises `MissingExtra` if compiled loops are asked
+        for without numba.
         """
+        is_fused()
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
             raise BadArgument(
                 "arm",

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.fused import array, compiled, inlined
+from torchgrasp.geometry.fused_vectors import put
 from torchgrasp.shape.jets import Explain, Weighted, distance_rows
 from torchgrasp.shape.kernel import Queries, separations
 
@@ -106,6 +107,16 @@ def sum_thin_plate(x, y, a, b, psi, bent):
     return distance, (g0, g1, g2), (xx + trace, yy + trace, zz + trace, xy, xz, yz)
 
 
+@inlined
+def put_hessian(hessian, curved):
+    """Write the six numbers of `sum_thin_plate` into a Hessian (3, 3)."""
+    for k in range(3):
+        hessian[k, k] = curved[k]
+    hessian[0, 1] = hessian[1, 0] = curved[3]
+    hessian[0, 2] = hessian[2, 0] = curved[4]
+    hessian[1, 2] = hessian[2, 1] = curved[5]
+
+
 @compiled
 def _sum_at(x, y, a, b, psi, distance, gradient, hessian):
     """Write the sums at each point x (q, 3).
@@ -116,11 +127,6 @@ def _sum_at(x, y, a, b, psi, distance, gradient, hessian):
     for i in range(len(x)):
         own = i if len(a) > 1 else 0
         distance[i], slope, curved = sum_thin_plate(x[i], y, a[own], b[own], psi, bent)
-        for k in range(3):
-            gradient[i, k] = slope[k]
-            if bent:
-                hessian[i, k, k] = curved[k]
+        put(gradient[i], slope)
         if bent:
-            hessian[i, 0, 1] = hessian[i, 1, 0] = curved[3]
-            hessian[i, 0, 2] = hessian[i, 2, 0] = curved[4]
-            hessian[i, 1, 2] = hessian[i, 2, 1] = curved[5]
+            put_hessian(hessian[i], curved)
