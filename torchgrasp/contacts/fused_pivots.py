@@ -60,14 +60,17 @@ def _pivot(objective, bounds, numbers, tight, ray):
             if entering < 0:
                 ray[g] = step
                 break
-            slack -= max(length, 0.0) * rate
-            change[:] = 0.0
-            for i in range(d):
-                change += bounds[g, entering, i] * inverse[i]
-            pivot = change[leaving]
+            for k in range(m):  # whole rows would each take an array
+                slack[k] -= max(length, 0.0) * rate[k]
+            for j in range(d):
+                change[j] = 0.0
+                for i in range(d):
+                    change[j] += bounds[g, entering, i] * inverse[i, j]
+            share = sign / change[leaving]
             change[leaving] -= 1.0
             for i in range(d):
-                inverse[i] -= sign * step[i] / pivot * change
+                for j in range(d):
+                    inverse[i, j] -= share * step[i] * change[j]
             if tight[g, leaving] >= 0:
                 held[tight[g, leaving]] = False
             held[entering] = True
