@@ -20,6 +20,7 @@ from torchgrasp import (
     plan_grasps,
     stream_grasps,
 )
+from torchgrasp.contacts.form_closure import maximise
 from torchgrasp.contacts.problem import ContactProblem
 from torchgrasp.contacts.solver import Stage, descend, project, start_state
 from torchgrasp.foundation import fused
@@ -31,6 +32,7 @@ from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.motion import _clearance
 from torchgrasp.ik.refine import grasp_residuals, open_hand, refine
+from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
 from torchgrasp.shape.fit import fit_shape
 
 
@@ -183,6 +185,31 @@ def test_a_stage_of_the_contact_solver(shape, both, fingertips, table):
         named_tensors(found.jet).values(), named_tensors(wanted.jet).values(), strict=True
     ):
         torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
+
+
+def test_linear_programmes(both):
+    """The objective grows without bound where it lies outside the cone of the bounds."""
+    bounds = random(30, 12, 6)
+    objective = bounds.mean(1) + 0.2 * random(30, 6, seed=1)
+    wanted, found = both(lambda: maximise(objective, bounds))
+    unbounded = (bounds @ wanted[0][..., None]).amax((1, 2)) < 0.5
+    assert unbounded.any() and not unbounded.all()
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("reachable", [None, lambda poses: poses[:, 2, 3] > 0])
+def test_initial_postures(hand, worlds, both, reachable):
+    library = PostureLibrary.of(hand, 60)
+    at = postures(hand, 5)
+    contacts = touched_contacts(hand, at.joints, at.obj_from_hand)
+    for world in worlds:
+        wanted, found = both(
+            lambda world=world: nearest_postures(library, contacts, world, 4, reachable)
+        )
+        assert len(wanted) > 5
+        for name, one in named_tensors(found).items():
+            torch.testing.assert_close(one, named_tensors(wanted)[name], rtol=0, atol=0)
 
 
 def test_plans_with_and_without_loops(both):

@@ -38,7 +38,7 @@ KNOWN = {
     "ik/motion.py": "_clearance find_approach",
     "ik/seeds.py": "_drawn nearest_postures",
     "contacts/certify.py": "_prove check_unit forward",
-    "contacts/form_closure.py": "_closed_in_plane maximise rank_ratio",
+    "contacts/form_closure.py": "_closed_in_plane _pivot rank_ratio",
     "contacts/feasibility.py": "check_feasibility normal_variation",
     "contacts/problem.py": "of",
     "contacts/plan.py": "plan_chunk",

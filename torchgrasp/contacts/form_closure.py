@@ -27,6 +27,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import FINGERTIPS, at_once, flatnonzero, in_chunks
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.geometry.frames import degenerate, subsets
 from torchgrasp.geometry.linalg import dot, eye_like, matvec, norm, perpendicular, unit
 from torchgrasp.shape.kernel import is_plain
@@ -213,6 +214,33 @@ def maximise(
     tight; and their multipliers. The simplex method runs for all programmes at once, until all are
     optimal. The point v = 0 is feasible, so there is no first phase.
     """
+    b, _, d = bounds.shape
+    tight, ray = _pivot(objective, bounds)
+    # From the tight rows alone, so that the roundings of the pivots are gone.
+    artificial = tight < 0
+    index = tight.clamp(min=0)
+    chosen = bounds.gather(1, index[:, :, None].expand(b, d, d))
+    basis = torch.where(artificial[:, :, None], eye_like(d, bounds), chosen)
+    vertex, _ = torch.linalg.solve_ex(basis, (~artificial).to(bounds))
+    multiplier, _ = torch.linalg.solve_ex(basis.mT, objective)
+    multiplier = torch.where(artificial, 0.0, multiplier)
+    unbounded = (ray != 0).any(1, keepdim=True)
+    return torch.where(unbounded, ray, vertex), index, multiplier
+
+
+def _pivot(
+    objective: Float[Tensor, "b d"], bounds: Float[Tensor, "b m d"]
+) -> tuple[Int[Tensor, "b d"], Float[Tensor, "b d"]]:
+    """Return the indices of the tight bounds of the programmes of `maximise`, then directions.
+
+    The index is -1 for the rows of v = 0 itself that never left. The direction is that in which
+    a.v grows without bound, or 0.
+    """
+    if is_fused(objective, bounds):
+        from torchgrasp.contacts import fused_pivots  # it imports numba
+
+        numbers = PIVOTS, OPTIMAL, ARTIFICIAL_GAIN, BLOCKING
+        return fused_pivots.pivot(objective, bounds, numbers)
     b, m, d = bounds.shape
     row = torch.arange(b, device=bounds.device)
     # The first tight rows are artificial, v = 0 itself: they leave first, in either direction.
@@ -257,16 +285,7 @@ def maximise(
         inverse = torch.where(running[:, None, None], updated, inverse)
         before = tight[row, leaving]
         tight[row, leaving] = torch.where(running, entering, before)
-    # From the tight rows alone, so that the roundings of the pivots are gone.
-    artificial = tight < 0
-    index = tight.clamp(min=0)
-    chosen = bounds.gather(1, index[:, :, None].expand(b, d, d))
-    basis = torch.where(artificial[:, :, None], eye_like(d, bounds), chosen)
-    vertex, _ = torch.linalg.solve_ex(basis, (~artificial).to(bounds))
-    multiplier, _ = torch.linalg.solve_ex(basis.mT, objective)
-    multiplier = torch.where(artificial, 0.0, multiplier)
-    unbounded = (ray != 0).any(1, keepdim=True)
-    return torch.where(unbounded, ray, vertex), index, multiplier
+    return tight, ray
 
 
 def closed_exact(

@@ -72,16 +72,16 @@ class WorldPart(NamedTuple):
 
 
 @inlined
-def _turn(frame, v):
+def turn(frame, v):
     """Return a direction in the frame in which the columns of a pose, the rows of `frame`, are."""
     turned = scale(frame[0], v[0])
     return add(add(turned, frame[1], v[1]), frame[2], v[2])
 
 
 @inlined
-def _place(frame, v):
+def place(frame, v):
     """Return a point in that frame."""
-    return add(_turn(frame, v), frame[3], 1.0)
+    return add(turn(frame, v), frame[3], 1.0)
 
 
 @inlined
@@ -98,7 +98,7 @@ def _place_links(h, joints, pose, frames):
         for c in range(4):
             local = add(add(constant[c], sine[c], math.sin(q)), cosine[c], math.cos(q))
             local = add(local, slide[c], q)
-            put(frames[k, c], _turn(frames[h.parent[k]], local))
+            put(frames[k, c], turn(frames[h.parent[k]], local))
         put(frames[k, 3], add(frames[k, 3], frames[h.parent[k], 3], 1.0))
 
 
@@ -207,9 +207,9 @@ def _part_links(h, n, frames, twists, axes, centers, residual, jacobian):
     """Write the rows of the pairs of links that are nearest, as `clearance_rows`."""
     for s in range(len(centers)):
         frame = frames[h.shape_link[s]]
-        put(centers[s], _place(frame, h.shape_center[s]))
+        put(centers[s], place(frame, h.shape_center[s]))
         for i in range(3):
-            put(axes[s, i], _turn(frame, h.shape_axes[s, i]))
+            put(axes[s, i], turn(frame, h.shape_axes[s, i]))
     used = 0
     for p in range(len(h.pairs)):
         a, b = h.pairs[p]
@@ -344,16 +344,16 @@ def _evaluate(h, parts, n, joints, pose, target, normals, room, residual, jacobi
     _place_links(h, joints, pose, frames)
     for q in range(len(twists)):
         frame = frames[h.motion_link[q]]
-        turning = _turn(frame, h.turning[q])
+        turning = turn(frame, h.turning[q])
         put(twists[q, 1], turning)
-        sliding = _turn(frame, h.sliding[q])
+        sliding = turn(frame, h.sliding[q])
         put(twists[q, 0], add(cross(frame[3], turning), sliding, 1.0))
     tips = len(h.tip_link)
     for f in range(tips):
         frame = frames[h.tip_link[f]]
         moves = h.moves[h.tip_link[f]]
-        center = _place(frame, h.tip_center[f])
-        pad = _turn(frame, h.tip_normal[f])
+        center = place(frame, h.tip_center[f])
+        pad = turn(frame, h.tip_normal[f])
         for k in range(3):
             row = 3 * f + k
             residual[row] = n.tip * (center[k] - target[f, k])
@@ -369,7 +369,7 @@ def _evaluate(h, parts, n, joints, pose, target, normals, room, residual, jacobi
     last = first + min(n.hinges, len(h.pairs))
     _part_links(h, n, frames, twists, axes, centers, residual[first:last], jacobian[first:last])
     for s in range(len(spheres)):
-        put(spheres[s], _place(frames[h.sphere_link[s]], h.sphere_center[s]))
+        put(spheres[s], place(frames[h.sphere_link[s]], h.sphere_center[s]))
     for part in parts:
         if part.kind:
             first = last
@@ -501,7 +501,7 @@ def solve(
     """Return configurations after at most `steps` steps, and their residuals and Jacobian."""
     tables = hand.derived.get(HandTables) or hand.derived.setdefault(HandTables, _tables(hand))
     spheres = hand.collision_spheres
-    parts = _parts(spheres.radius, spheres.touching & tips_touch, world)
+    parts = world_parts(spheres.radius, spheres.touching & tips_touch, world)
     count = sum(part.kind > 0 for part in parts)
     hinges = [min(HINGES, len(tables.pairs)), *[min(HINGES, len(tables.sphere_link))] * count]
     rows = 4 * len(hand.tips) + sum(hinges)
@@ -571,7 +571,7 @@ def _tables(hand: Hand) -> HandTables:
     )
 
 
-def _parts(
+def world_parts(
     radius: Float[Tensor, "s"], touching: Bool[Tensor, "s"], world: CollisionWorld
 ) -> tuple[WorldPart, ...]:
     """Return object, obstacles and table of a world, in this order; the spheres in the mask
@@ -643,7 +643,7 @@ def sweep(
     It is exact with `nodes`, the error in grid spacings of a clearance at the nearest node; with 0
     it is that at the nearest nodes.
     """
-    parts = _parts(radius, torch.zeros_like(radius, dtype=torch.bool), world)
+    parts = world_parts(radius, torch.zeros_like(radius, dtype=torch.bool), world)
     least = torch.empty_like(centres[:, 0, 0])
     coarse = np.empty((steps, len(radius)))
     _sweep(parts, array(centres), array(direction), step, nodes, coarse, least.numpy())

@@ -31,7 +31,7 @@ from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import dot, eye_like, norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost, is_world_fused
 from torchgrasp.ik.refine import TIP_WEIGHT
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture, check_compatible, encode
 from torchgrasp.posture_model.sample import sample_configurations
@@ -254,6 +254,7 @@ def nearest_postures(
     inward = -contacts.normals.double()[:, permutations]
     centres = contacts.points.double()[:, permutations] - radius[:, None] * inward  # (n, p, f, 3)
     framed = ~degenerate(triangle_of(centres))
+    count = n_seeds if reachable is None else min(SEEDS.spare * n_seeds, candidates)
     parts = []
     for row in flatnonzero(framed.any(1)).split(at_once(centres, SEEDS.rows)):
         # of all assignments of contacts to fingers, a few are compared with the whole library
@@ -263,59 +264,81 @@ def nearest_postures(
         obj_from_vf = obj_from_vf[at, assignment]
         wanted = wanted[at, assignment]
         energy = _energies(wanted, given, framed[row[:, None], assignment])
-        # the c nearest pairs of assignment and posture (r, c)
-        energy, index = energy.flatten(1).topk(candidates, 1, largest=False)
-        order = index // len(given)
-        sample = index % len(given)
-        # they are placed by Eq. (24), and ranked by clearance, too
+        # pairs of assignment and posture, best first (r, c)
+        energy = energy.flatten(1)
+        there = world.rows(row)
+        pair = _rank_pairs(library, energy, obj_from_vf, there, candidates, count)
+        order = pair // len(given)
+        sample = pair % len(given)
         obj_from_hand = obj_from_vf[at, order] @ library.vf_from_hand[sample]
-        placed = obj_from_hand.flatten(0, 1).float()
-        spheres = library.spheres.mT[sample.flatten()]
-        spheres = torch.baddbmm(placed[:, :3, 3:], placed[:, :3, :3], spheres)
-        spheres = spheres.mT.unflatten(0, sample.shape)  # (r, c, k, 3)
-        # squared millimetres, weighed as in `refine`
-        tips = 2 * energy * (TIP_WEIGHT * SEEDS.length_scale / MILLIMETRE) ** 2
-        cost = tips + collision_cost(spheres, library.hand.collision_spheres, world.rows(row))
-        b, best = _choose(cost, obj_from_hand, n_seeds, reachable)
+        b, best = _choose(obj_from_hand, n_seeds, reachable)
+        energy = energy[b, pair[b, best]].double()
         order = order[b, best]
         sample = sample[b, best]
         chosen = assignment[b, order]
         gap = apply(obj_from_vf[b, order], library.centres[sample]) - centres[row[b], chosen]
         tip_error = norm(gap)
-        energy = energy[b, best].double()
         joints = library.joints[sample]
         pose = obj_from_hand[b, best]
         parts.append(IKSeeds(joints, pose, row[b], permutations[chosen], energy, tip_error))
     return join(parts).to(contacts.points.dtype)
 
 
+def _rank_pairs(
+    library: PostureLibrary,
+    energy: Float[Tensor, "r p"],
+    obj_from_vf: Float[Tensor, "r a 4 4"],
+    world: CollisionWorld,
+    candidates: int,
+    count: int,
+) -> Int[Tensor, "r count"]:
+    """Return the pairs of assignment and posture of the least cost [mm2], best first.
+
+    Pair a s + k is that of assignment a and posture k. Only the `candidates` of the least `energy`
+    are placed, by Eq. (24). The cost is that of the tips' error plus `collision_cost`.
+    """
+    # squared millimetres, weighed as in `refine`
+    weight = 2 * (TIP_WEIGHT * SEEDS.length_scale / MILLIMETRE) ** 2
+    posed = obj_from_vf, library.vf_from_hand, library.spheres
+    spheres = library.hand.collision_spheres
+    if is_world_fused(world, *posed[:2]):
+        from torchgrasp.ik import fused_seeds  # it imports numba
+
+        return fused_seeds.rank_pairs(energy, *posed, spheres, world, weight, candidates, count)
+    energy, pair = energy.topk(candidates, 1, largest=False)
+    sample = pair % len(library.joints)
+    at = row_numbers(pair)[:, None]
+    placed = obj_from_vf[at, pair // len(library.joints)] @ library.vf_from_hand[sample]
+    placed = placed.flatten(0, 1).float()
+    centres = library.spheres.mT[sample.flatten()]
+    centres = torch.baddbmm(placed[:, :3, 3:], placed[:, :3, :3], centres)
+    centres = centres.mT.unflatten(0, sample.shape)  # (r, c, k, 3)
+    cost = weight * energy + collision_cost(centres, spheres, world)
+    return pair.gather(1, cost.topk(count, 1, largest=False).indices)
+
+
 def _choose(
-    cost: Float[Tensor, "r c"],
-    obj_from_hand: Float[Tensor, "r c 4 4"],
-    n_seeds: int,
-    reachable: Reachable | None,
+    obj_from_hand: Float[Tensor, "r c 4 4"], n_seeds: int, reachable: Reachable | None
 ) -> tuple[Int[Tensor, "k"], Int[Tensor, "k"]]:
     """Return the contact set of each chosen candidate, then its index among the c candidates of the
-    set.
+    set, best first.
 
-    At most `n_seeds` of each set are chosen, those of the lowest `cost`. The next takes the place
-    of a hand pose that is not `reachable`.
+    At most `n_seeds` of each set are chosen, the first. The next takes the place of a hand pose
+    that is not `reachable`.
     """
-    at = row_numbers(cost)[:, None]
+    reached = torch.zeros_like(obj_from_hand[..., 0, 0], dtype=torch.bool)
+    at = row_numbers(obj_from_hand)[:, None].expand_as(reached)
+    best = torch.arange(reached.shape[1], device=at.device).expand_as(reached)
     if reachable is None:
-        best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
-        return at[:, 0].repeat_interleave(n_seeds), best
-    count = min(SEEDS.spare * n_seeds, cost.shape[1])
-    best = cost.topk(count, 1, largest=False).indices
-    reached = torch.zeros_like(best, dtype=torch.bool)
+        return at.flatten(), best.flatten()
     # the spare ones are asked for only where some of the first are refused
     for some in (slice(n_seeds), slice(n_seeds, None)):
         short = flatnonzero(reached.sum(1) < n_seeds)
-        poses = obj_from_hand[short[:, None], best[short, some]]
+        poses = obj_from_hand[short, some]
         answers = ask_reachable(reachable, poses.flatten(0, 1))
         reached[short, some] = answers.reshape(poses.shape[:2])
     kept = reached & (reached.cumsum(1) <= n_seeds)
-    return at.expand_as(best)[kept], best[kept]
+    return at[kept], best[kept]
 
 
 def _describe(
