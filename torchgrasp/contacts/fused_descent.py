@@ -109,7 +109,8 @@ def _constrain(n, contacts, pairs, signs, up, room, value, jacobian):
                 jacobian[row, 3 * i + c] = -dot(up, rolled[i, :, c])
     for k in range(p):
         row = 3 + 4 * f + k
-        i, j = pairs[0, k], pairs[1, k]
+        i = pairs[0, k]
+        j = pairs[1, k]
         side = add(points[j], points[i], -1.0)
         side = add(add(side, normals[j], n.tip), normals[i], -n.tip)
         length = math.sqrt(dot(side, side))
@@ -193,14 +194,15 @@ def _descend(
     p = tension.shape[1]
     u = 3 * f + p
     rows = 3 + 4 * f + p + (f if len(up) else 0)
-    value, weight, residual = np.empty(rows), np.empty(rows), np.empty(rows)
-    jacobian, other, matrix, x = (
-        np.empty((rows, u)),
-        np.empty((rows, u)),
-        np.empty((u, u)),
-        np.empty(u),
-    )
-    new_weight, new_residual = np.empty(rows), np.empty(rows)
+    value = np.empty(rows)
+    weight = np.empty(rows)
+    residual = np.empty(rows)
+    jacobian = np.empty((rows, u))
+    other = np.empty((rows, u))
+    matrix = np.empty((u, u))
+    x = np.empty(u)
+    new_weight = np.empty(rows)
+    new_residual = np.empty(rows)
     room = np.empty((f, 3)), np.empty((f, 3, 3))
     new = (
         np.empty((f, 3)),

@@ -16,8 +16,12 @@ def _pivot(objective, bounds, numbers, tight, ray):
     """Write the tight bounds and the rays of all programmes, as `pivot` returns them."""
     pivots, optimal, first, parallel = numbers
     b, m, d = bounds.shape
-    inverse, step, change = np.empty((d, d)), np.empty(d), np.empty(d)
-    slack, rate, held = np.empty(m), np.empty(m), np.empty(m, np.bool_)
+    inverse = np.empty((d, d))
+    step = np.empty(d)
+    change = np.empty(d)
+    slack = np.empty(m)
+    rate = np.empty(m)
+    held = np.empty(m, np.bool_)
     for g in range(b):
         inverse[:] = 0.0
         for i in range(d):

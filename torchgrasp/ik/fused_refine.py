@@ -277,21 +277,30 @@ def _lerp(a, b, share):
 @inlined
 def _exact(part, p):
     """Return distance and gradient, as `DistanceField.query`."""
-    x, y, z = _cell(part, p, 0), _cell(part, p, 1), _cell(part, p, 2)
-    inside_x, inside_y, inside_z = _inside(part, x, 0), _inside(part, y, 1), _inside(part, z, 2)
+    x = _cell(part, p, 0)
+    y = _cell(part, p, 1)
+    z = _cell(part, p, 2)
+    inside_x = _inside(part, x, 0)
+    inside_y = _inside(part, y, 1)
+    inside_z = _inside(part, z, 2)
     nx, ny, nz = part.shape
     i = min(int(inside_x), nx - 2)
     j = min(int(inside_y), ny - 2)
     k = min(int(inside_z), nz - 2)
-    fx, fy, fz = inside_x - i, inside_y - j, inside_z - k
+    fx = inside_x - i
+    fy = inside_y - j
+    fz = inside_z - k
     at = (i * ny + j) * nz + k
     v = part.values
     low = v[at], v[at + nz], v[at + ny * nz], v[at + ny * nz + nz]
     at += 1
     high = v[at], v[at + nz], v[at + ny * nz], v[at + ny * nz + nz]
-    p00, p01 = _lerp(low[0], high[0], fz), _lerp(low[1], high[1], fz)
-    p10, p11 = _lerp(low[2], high[2], fz), _lerp(low[3], high[3], fz)
-    back, front = _lerp(p00, p01, fy), _lerp(p10, p11, fy)
+    p00 = _lerp(low[0], high[0], fz)
+    p01 = _lerp(low[1], high[1], fz)
+    p10 = _lerp(low[2], high[2], fz)
+    p11 = _lerp(low[3], high[3], fz)
+    back = _lerp(p00, p01, fy)
+    front = _lerp(p10, p11, fy)
     up_back = _lerp(high[0] - low[0], high[1] - low[1], fy)
     up_front = _lerp(high[2] - low[2], high[3] - low[3], fy)
     slope = front - back, _lerp(p01 - p00, p11 - p10, fx), _lerp(up_back, up_front, fx)
@@ -449,8 +458,10 @@ def _solve(h, parts, n, joints, poses, target, normals, residual, jacobian):
     d = jacobian.shape[2]
     free = d - 6 + n.free
     trial = np.empty(residual.shape[1]), np.empty(jacobian.shape[1:])
-    new_joints, new_pose = np.empty(joints.shape[1]), np.empty((4, 4))
-    matrix, x = np.empty((free, free)), np.empty(free)
+    new_joints = np.empty(joints.shape[1])
+    new_pose = np.empty((4, 4))
+    matrix = np.empty((free, free))
+    x = np.empty(free)
     hinges = min(n.hinges, len(h.sphere_link))
     shapes = len(h.shape_link)
     room = (

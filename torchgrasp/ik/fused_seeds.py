@@ -57,7 +57,9 @@ def _collide(part, frame, spheres, clearance, unit, cost, limit, node):
     if part.kind == 0 or cost >= limit:
         return cost
     if part.kind == 1:
-        a, b, c = dot(frame[0], part.origin), dot(frame[1], part.origin), dot(frame[2], part.origin)
+        a = dot(frame[0], part.origin)
+        b = dot(frame[1], part.origin)
+        c = dot(frame[2], part.origin)
         room = clearance + part.spacing - dot(frame[3], part.origin)
         for s in range(len(node)):
             lack = room - (a * x[s] + b * y[s] + c * z[s]) - part.grown[s]
@@ -67,7 +69,9 @@ def _collide(part, frame, spheres, clearance, unit, cost, limit, node):
     # the nodes come first, without a branch, so that vector instructions find them
     for axis in range(3):
         per = 1 / part.spacing
-        a, b, c = frame[0, axis] * per, frame[1, axis] * per, frame[2, axis] * per
+        a = frame[0, axis] * per
+        b = frame[1, axis] * per
+        c = frame[2, axis] * per
         first = (frame[3, axis] - part.origin[axis]) * per
         last = part.shape[axis] - 1.0
         for s in range(len(node)):
@@ -88,9 +92,11 @@ def _rank(energy, obj_from_vf, vf_from_hand, spheres, parts, numbers, candidates
     of poses, `spheres` (s, 3, k) coordinates.
     """
     weight, unit, clearance = numbers
-    least, index = np.empty(candidates, energy.dtype), np.empty(candidates, np.int64)
+    least = np.empty(candidates, energy.dtype)
+    index = np.empty(candidates, np.int64)
     costs = np.empty(pairs.shape[1])
-    frame, node = np.empty((4, 3)), np.empty(spheres.shape[2])
+    frame = np.empty((4, 3))
+    node = np.empty(spheres.shape[2])
     for r in range(len(energy)):
         _find_least(energy[r], block, least, index)
         costs[:] = math.inf

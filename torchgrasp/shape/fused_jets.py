@@ -79,8 +79,12 @@ def sum_thin_plate(x, y, a, b, psi, bent):
     """
     distance = g0 = g1 = g2 = trace = xx = yy = zz = xy = xz = yz = 0.0
     for j in range(len(a)):
-        d0, d1, d2 = x[0] - y[0, j], x[1] - y[1, j], x[2] - y[2, j]
-        b0, b1, b2 = b[0, j], b[1, j], b[2, j]
+        d0 = x[0] - y[0, j]
+        d1 = x[1] - y[1, j]
+        d2 = x[2] - y[2, j]
+        b0 = b[0, j]
+        b1 = b[1, j]
+        b2 = b[2, j]
         square = d0 * d0 + d1 * d1 + d2 * d2
         r = math.sqrt(square)
         # the kernel and its derivatives by r^2 / 2
@@ -97,7 +101,9 @@ def sum_thin_plate(x, y, a, b, psi, bent):
         if bent:
             trace += c
             outer = second * a[j] - third * along
-            s0, s1, s2 = second * b0, second * b1, second * b2
+            s0 = second * b0
+            s1 = second * b1
+            s2 = second * b2
             xx += (outer * d0 - 2.0 * s0) * d0
             yy += (outer * d1 - 2.0 * s1) * d1
             zz += (outer * d2 - 2.0 * s2) * d2
