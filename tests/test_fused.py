@@ -227,7 +227,7 @@ def test_loops_are_asked_for_and_take_plain_float64_alone(monkeypatch):
     assert not fused.is_fused(x)
     monkeypatch.setenv(fused.VARIABLE, "1")
     monkeypatch.setattr(fused, "has_numba", lambda: False)
-    with pytest.raises(MissingExtra, match=r"torchgrasp\[fast\]"):
+    with pytest.raises(MissingExtra, match=r"TORCHGRASP_FUSED=1 needs numba.*torchgrasp\[fast\]"):
         fused.is_fused(x)
     with pytest.raises(MissingExtra):  # at the call, before any work
         stream_grasps(load_object("cylinder").view, load_hand("allegro"))

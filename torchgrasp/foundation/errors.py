@@ -109,11 +109,13 @@ class OutputError(BadArgument):
 class MissingExtra(GraspError, ImportError):
     """A package that an optional feature needs is not installed.
 
-    `package` is its name, and `extra` the extra of torchgrasp that installs it.
+    `package` is its name, and `extra` the extra of torchgrasp that installs it. `asked` is the
+    setting that asks for it, where the call does not show it.
     """
 
-    def __init__(self, package: str, extra: str):
-        super().__init__(f"{package} is not installed: pip install 'torchgrasp[{extra}]'")
+    def __init__(self, package: str, extra: str, asked: str = ""):
+        needed = f"{asked} needs {package}, which" if asked else package
+        super().__init__(f"{needed} is not installed: pip install 'torchgrasp[{extra}]'")
         self.package = package
         self.extra = extra
 

@@ -41,7 +41,7 @@ def is_fused(*tensors: Tensor) -> bool:
     if os.environ.get(VARIABLE) != "1":
         return False
     if not has_numba():
-        raise MissingExtra("numba", "fast")
+        raise MissingExtra("numba", "fast", f"{VARIABLE}=1")
     return all(
         x.dtype == torch.float64 and x.device.type == "cpu" and is_known(x) and not is_tracked(x)
         for x in tensors
