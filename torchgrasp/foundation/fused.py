@@ -70,7 +70,7 @@ def inlined(function: Any) -> Any:
     return _compile(function, **options)
 
 
-def _compile(function: Any, **options: bool) -> Any:
+def _compile(function: Any, **options: Any) -> Any:
     """Return the function itself without numba: the same loops, but slow."""
     # checks of annotations, as tests add them, can not be compiled
     plain = inspect.unwrap(function)
