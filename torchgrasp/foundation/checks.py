@@ -43,7 +43,6 @@ from torchgrasp.foundation.rules import (
     check_plain,
     describe,
     fits,
-    fits_plain,
     is_known,
     is_rigid,
     is_tensor,
@@ -76,12 +75,6 @@ class _Call:
     sizes: dict[str, Any] = dataclasses.field(default_factory=dict[str, Any])
     finite: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
     rigid: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
-
-    def inner(self, **changed: Any) -> "_Call":
-        """Return the state for a part of an argument; `changed` fields are its own."""
-        new = object.__new__(_Call)  # faster than dataclasses.replace
-        new.__dict__ |= self.__dict__ | changed
-        return new
 
     def check_numbers(self) -> None:
         """Raise `BadArgument` if a tensor in `finite` has NaN or infinity, or one in `rigid` is no
@@ -255,7 +248,7 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
     elif isinstance(value, Tensor) and hint not in (object, Any):
         check_dense(name, value, call.gradients)
     elif call.deep and hasattr(type(value), "__checked__") and dataclasses.is_dataclass(value):
-        inner = call.inner(sizes={})  # the letters of a value are its own
+        inner = dataclasses.replace(call, sizes={})  # the letters of a value are its own
         for field, of_field in _fields(type(value)).items():
             _read(f"{name}.{field}", getattr(value, field), of_field, inner)
     elif call.deep and not call.gradients and dataclasses.is_dataclass(value):
@@ -308,8 +301,8 @@ def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> An
     if mark == ANY and hint is float and isinstance(value, float):
         return value
     if mark == ANY and not call.strict:
-        call = call.inner(finite={})
-    inner = call.inner(strict=True) if mark == FINITE else call
+        call = dataclasses.replace(call, finite={})
+    inner = dataclasses.replace(call, strict=True) if mark == FINITE else call
     result = _read(name, value, hint, inner)
     if mark == RIGID:
         call.rigid[name] = result
@@ -348,16 +341,12 @@ def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
     """Return a tensor if it has the annotated shape and dtype; record the sizes of the axes that
     are letters.
     """
-    axes, plain, kind, dtypes = _shape(hint)
+    axes, dtypes = _shape(hint)
     sizes = dict(call.sizes)
     if not isinstance(value, Tensor):
         raise BadArgument(name, show(value), f"a torch {describe(hint)[2:]}")
     check_dense(name, value, gradients=True)
-    if plain is None:
-        good = fits(axes, tuple(value.shape), sizes)
-    else:
-        good = fits_plain(plain, value.shape, sizes)
-    if not good:
+    if not fits(axes, tuple(value.shape), sizes):
         known = [
             f"{axis} = {call.sizes[axis]}" for axis in dict.fromkeys(axes) if axis in call.sizes
         ]
@@ -372,24 +361,15 @@ def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
     call.sizes.update(sizes)
     if value.is_inference():  # torch refuses it where derivatives are taken
         value = value.clone()
-    if kind == "Float":
+    if hint.dtype.__name__ == "Float":
         call.finite[name] = value
     return value
 
 
 @functools.cache
-def _shape(
-    hint: Any,
-) -> tuple[list[str], tuple[int | str, ...] | None, str, tuple[torch.dtype, ...]]:
-    """Return the axes of an annotated tensor, the same for `fits_plain` or None, the name of its
-    kind, and the dtypes of that kind.
-    """
-    axes = hint.dim_str.split()
-    plain = None
-    if not any(axis[0] in "*.#" for axis in axes):
-        plain = tuple(int(axis) if axis.isdigit() else axis for axis in axes)
-    kind = hint.dtype.__name__
-    return axes, plain, kind, DTYPES.get(kind) or sum(DTYPES.values(), ())
+def _shape(hint: Any) -> tuple[list[str], tuple[torch.dtype, ...]]:
+    """Return the axes of an annotated tensor, and the dtypes of its kind."""
+    return hint.dim_str.split(), DTYPES.get(hint.dtype.__name__) or sum(DTYPES.values(), ())
 
 
 def _read_container(

@@ -171,18 +171,6 @@ def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool
     return True
 
 
-def fits_plain(axes: tuple[int | str, ...], shape: torch.Size, sizes: dict[str, Any]) -> bool:
-    """Return the same as `fits` for axes that are numbers, letters and "_" alone."""
-    if len(axes) != len(shape):
-        return False
-    for axis, n in zip(axes, shape, strict=True):
-        if axis == n or axis == "_":
-            continue
-        if isinstance(axis, int) or sizes.setdefault(axis, n) != n:
-            return False
-    return True
-
-
 def check_dense(name: str, value: Tensor, gradients: bool) -> None:
     """Raise `BadArgument` if the tensor `value` is sparse, nested or meta, or has the negative bit.
 

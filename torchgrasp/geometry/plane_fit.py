@@ -326,7 +326,8 @@ def refine_plane(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) ->
         size = ratio.abs()
         core = size[size < PLANES.core * scale]
         if len(core):
-            measured = float(PLANES.per_quantile * _quantile(core, PLANES.quantile))
+            # torch.quantile sorts all numbers, which takes several times as long
+            measured = PLANES.per_quantile * float(np.quantile(core.numpy(), PLANES.quantile))
             scale = min(max(measured, PLANES.smooth), PLANES.rough)
         share = (ratio / (PLANES.tukey * scale)).square()
         weight = (1 - share).clamp_min(0).square() / variance
@@ -344,13 +345,3 @@ def refine_plane(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) ->
             break
     on = ((points @ normal - offset).abs() / noise) < PLANES.core * scale
     return PlaneFit(normal, offset, scale, int(on.sum()))
-
-
-def _quantile(values: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
-    """Return what `torch.quantile` does, but for rounding; it sorts all n numbers, which takes much
-    longer.
-    """
-    rank = share * (len(values) - 1)
-    ends = [math.floor(rank), math.ceil(rank)]
-    below, above = torch.from_numpy(np.partition(values.numpy(), ends)[ends])
-    return torch.lerp(below, above, rank - ends[0])

@@ -14,7 +14,7 @@ from torchgrasp.foundation.fused import array, compiled, inlined
 from torchgrasp.geometry.fused_vectors import dot, put
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld
-from torchgrasp.ik.fused_refine import place, turn, world_parts
+from torchgrasp.ik.fused_world import place, turn, world_parts
 
 BLOCK = 32  # numbers that are compared at a time, by vector instructions
 

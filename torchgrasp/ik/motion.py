@@ -162,11 +162,11 @@ def _clearance(
     """
     steps = FINE_STEPS if exact else COARSE_STEPS
     if is_world_fused(world, centres, direction):
-        from torchgrasp.ik import fused_refine  # it imports numba
+        from torchgrasp.ik import fused_path  # it imports numba
 
         step = APPROACH_DISTANCE / steps
         nodes = MOTION.nodes if exact else 0.0
-        return fused_refine.sweep(centres, radius, direction, world, steps, step, nodes)
+        return fused_path.sweep(centres, radius, direction, world, steps, step, nodes)
     path = _approach(centres, direction, steps).flatten(1, 2)
     radius = radius.repeat(steps)
     least = torch.full_like(path[:, 0, 0], math.inf)
