@@ -103,7 +103,13 @@ def postures(hand, n: int) -> Configuration:
 def test_jets_of_a_thin_plate(shape, both):
     """At its observed points, too, where derivatives are 0 / 0."""
     x = torch.cat([0.8 * random(6, 3), shape.x[:3]])
-    for function in (shape.mean, shape.mean_and_gradient, shape.mean_jet, shape.jet):
+    for function in (
+        shape.mean,
+        shape.mean_and_gradient,
+        shape.variance,
+        shape.mean_jet,
+        shape.jet,
+    ):
         wanted, found = both(lambda function=function: function(x))
         if isinstance(wanted, Value):
             wanted, found = (named_tensors(y).values() for y in (wanted, found))

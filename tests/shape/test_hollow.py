@@ -6,12 +6,13 @@ from torch import Tensor
 
 from tests.make import CUP_HEIGHT as HEIGHT
 from tests.make import CUP_RADIUS as RADIUS
-from tests.make import cup, cup_view, near
+from tests.make import cup, cup_view, near, real
 from tests.make import cylinder_points as ring
 from torchgrasp import Contacts, fit_shape
 from torchgrasp.contacts.closure_probability import line_posterior
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.mesh import closest_on_triangles
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.hollow import HollowShape, Middle, tie_walls
 from torchgrasp.shape.surface import extract_surface
 
@@ -55,6 +56,25 @@ def test_both_walls_are_surfaces_the_inside_is_empty_and_all_moves_with_the_vess
     moved = vessel.moved(motion).predict(there)
     near(moved.distance, found.distance, 1e-9)
     near(moved.normal, found.normal @ motion[:3, :3].T, 1e-8)
+
+
+def test_an_estimate_without_covariance_is_the_same_else(vessel: HollowShape):
+    """On both walls, and outside the domain, with its slope there."""
+    points, _ = _both_walls()
+    out = vessel.center + real([[0.0, 0.0, 1.5]]) * vessel.domain_radius * vessel.scale
+    points = torch.cat([points, out])
+    for shape in (vessel, vessel.outer):
+        whole = shape.predict(points)
+        short = shape.predict(points, covariance=False)
+        assert short.covariance is None
+        for name in ("distance", "normal", "variance", "std_m"):
+            near(getattr(short, name), getattr(whole, name), 1e-10)
+
+        def total(x: Tensor, covariance: bool, shape: ShapeGP = shape) -> Tensor:
+            found = shape.predict(x, covariance=covariance)
+            return found.std_m.sum() + found.normal.sum()
+
+        near(torch.func.grad(total)(points, False), torch.func.grad(total)(points, True), 1e-6)
 
 
 def test_a_touch_moves_the_wall_that_it_meets_and_closed_bodies_have_one_surface(

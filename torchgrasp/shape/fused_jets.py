@@ -12,8 +12,9 @@ from torch import Tensor
 
 from torchgrasp.foundation.fused import array, compiled, inlined
 from torchgrasp.geometry.fused_vectors import put
-from torchgrasp.shape.jets import Explain, Weighted, distance_rows
-from torchgrasp.shape.kernel import Queries, separations
+from torchgrasp.geometry.linalg import Points
+from torchgrasp.shape.jets import Explain, Weighted
+from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, float]
 """Observed points (3, n), weights of distances and of normals, and psi."""
@@ -33,14 +34,19 @@ def evaluate_mean_jet(of: Weighted, x: Queries) -> tuple[tuple[Tensor, Tensor, T
 def evaluate_jet(of: Weighted, x: Queries, explain: Explain) -> tuple[Tensor, ...]:
     """Return the fields of `SurfaceJet`."""
     mean = _mean(of, x, of.a[None], of.b.T[None], bent=True)
-    d, r = separations(x, of.x)
-    k, first = of.kernel.derivatives(r, 2)
     near = len(of.b)
-    explained, solved = explain(distance_rows(d, k, first, near))
+    explained, solved = explain(rows_at(of.x, near, of.kernel, x))
     n = len(of.x)
     slope = _mean(of, x, solved[:, :n], solved[:, n:].unflatten(1, (3, near)), bent=False)[1]
     variance = of.kernel.profile(x.new_zeros(len(x), 1))[:, 0] - explained
     return *mean, variance, -2.0 * slope
+
+
+def rows_at(known: Points, near: int, kernel: Kernel, x: Queries) -> CovarianceRows:
+    """Return the covariance of the distances at q points with all observations."""
+    found = x.new_empty(len(x), len(known) + 3 * near)
+    _put_rows(array(x), array(known.T), _psi_of(kernel), near, found.numpy())
+    return found
 
 
 def _mean(
@@ -67,9 +73,14 @@ def arrays_of(of: Weighted) -> Arrays:
 def _arrays(of: Weighted, a: Tensor, b: Tensor) -> Arrays:
     shifts = a.new_zeros(len(b), 3, len(of.x))  # points without normals have weight 0
     shifts[..., : b.shape[2]] = b
-    form = of.kernel.closed_form
+    return array(of.x.T), array(a), array(shifts), _psi_of(of.kernel)
+
+
+def _psi_of(kernel: Kernel) -> float:
+    """Return the normalised length of a thin plate."""
+    form = kernel.closed_form
     assert isinstance(form, partial)
-    return array(of.x.T), array(a), array(shifts), float(form.args[0])
+    return float(form.args[0])
 
 
 @inlined
@@ -136,3 +147,22 @@ def _sum_at(x, y, a, b, psi, distance, gradient, hessian):
         put(gradient[i], slope)
         if bent:
             put_hessian(hessian[i], curved)
+
+
+@compiled
+def _put_rows(x, y, psi, near, rows):
+    """Write the rows of `rows_at` for points x (q, 3) and n observed points y (3, n)."""
+    n = y.shape[1]
+    for i in range(len(x)):
+        for j in range(n):
+            d0 = x[i, 0] - y[0, j]
+            d1 = x[i, 1] - y[1, j]
+            d2 = x[i, 2] - y[2, j]
+            square = d0 * d0 + d1 * d1 + d2 * d2
+            r = math.sqrt(square)
+            rows[i, j] = square * (2.0 * r - 3.0 * psi) + psi**3
+            if j < near:
+                first = 6.0 * (psi - r)
+                rows[i, n + j] = first * d0
+                rows[i, n + near + j] = first * d1
+                rows[i, n + 2 * near + j] = first * d2

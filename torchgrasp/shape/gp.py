@@ -4,6 +4,7 @@ Eqs. (1), (7)-(9).
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import torch
@@ -22,7 +23,6 @@ from torchgrasp.geometry.plane import move
 from torchgrasp.shape.conditioning import append_observations
 from torchgrasp.shape.estimate import (
     JointEstimate,
-    Moments,
     Normalisation,
     Observations,
     ShapeDerivatives,
@@ -47,6 +47,8 @@ class DomainNumbers:
 
 
 DOMAIN = DomainNumbers()
+MeanAndSpread = tuple[Float[Tensor, "q 4"], Float[Tensor, "q k k"]]
+"""Mean and covariance of `estimate`, or with the first k rows and columns of the covariance alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,13 +182,21 @@ class ShapeGP(Posterior, Normalisation):
         return norm(self.normalise(points)) <= self.domain_radius
 
     @checked(gradients=True)
-    def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
+    def predict(
+        self,
+        points: Float[Tensor, "*b 3"],
+        *,
+        covariance: bool = True,
+    ) -> ShapeEstimate:
         """Return signed distance, normal and covariance at points (*b, 3) [m] in the cloud's frame,
         Eqs. (7)-(8) of the paper.
 
         Distance, variance and covariance are normalised: one unit is `scale` [m]. `std_m` is in
         metres. The estimate has the dtype of `points`, and is differentiable in the points. b
         stands for any batch axes.
+
+        With `covariance=False` the estimate's `covariance` is None, and the rest is the same up to
+        rounding. The call is then faster: it multiplies one row for each point instead of four.
 
         Points outside the domain, up to twice `domain_radius` from `center`, get a guess. There the
         distance grows outward with slope 1, from the distance at the nearest point of the domain.
@@ -201,11 +211,17 @@ class ShapeGP(Posterior, Normalisation):
         >>> shape.predict(edge + torch.tensor([0.01, 0.0, 0.0])).std_m > 0.1
         tensor(True)
         """
-        mean, spread = self._estimate_or_prior(self._queries(points, 2.0))
+        evaluate = self.estimate if covariance else self._estimate_distance
+        mean, spread = self._extend(evaluate, self._queries(points, 2.0))
         variance = spread[:, 0, 0]
         std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
-        parts = mean[:, 0], unit(mean[:, 1:]), variance, spread, std_m
-        return ShapeEstimate(*(_reshape(part, points) for part in parts))
+        return ShapeEstimate(
+            distance=_reshape(mean[:, 0], points),
+            normal=_reshape(unit(mean[:, 1:]), points),
+            variance=_reshape(variance, points),
+            covariance=_reshape(spread, points) if covariance else None,
+            std_m=_reshape(std_m, points),
+        )
 
     @checked(gradients=True)
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
@@ -417,27 +433,40 @@ class ShapeGP(Posterior, Normalisation):
             raise BadArgument("points", f"{found}, {distance}", allowed)
         return x
 
-    def _estimate_or_prior(self, x: Queries) -> Moments:
-        """Return the results of `estimate`; outside the domain a growing distance with the prior's
+    def _estimate_distance(self, x: Queries) -> MeanAndSpread:
+        """Return the results of `estimate` with the variance (q, 1, 1) of the distance alone."""
+        distance, gradient = self.mean_and_gradient(x)
+        mean = torch.cat([distance[:, None], gradient], 1)
+        return mean, self.variance(x)[:, None, None]
+
+    def _extend(
+        self,
+        evaluate: Callable[[Queries], MeanAndSpread],
+        x: Queries,
+    ) -> MeanAndSpread:
+        """Return the results of `evaluate`; outside the domain a growing distance with the prior's
         covariance.
 
-        The gradient there has length 1. A prior's variance is positive everywhere. Within the
+        `evaluate` is `estimate`, or has the first rows and columns of its covariance alone. The
+        gradient outside has length 1. A prior's variance is positive everywhere. Within the
         domain's diameter of the centre a ball of the domain's size holds both, and in such a ball
         the kernel is a covariance.
         """
         length = norm(x.detach(), keepdim=True)
         outside = length > self.domain_radius
         if not (is_known(outside) and bool(outside.any())):
-            return self.estimate(x)
+            return evaluate(x)
         # with finite derivatives at points inside, too
         outward = unit(torch.where(outside, x, 1.0))
         nearest = torch.where(outside, self.domain_radius * outward, x)
-        mean, spread = self.estimate(nearest)
+        mean, spread = evaluate(nearest)
         away = ((x - nearest) * outward).sum(-1, keepdim=True)
         slope = (mean[:, 1:] * outward).sum(-1, keepdim=True)
         across = self.domain_radius / (self.domain_radius + away) * (mean[:, 1:] - slope * outward)
         grown = torch.cat([mean[:, :1] + away, unit(outward + across)], 1)
-        spread = torch.where(outside[..., None], self.prior_block(), spread)
+        rows = spread.shape[-1]
+        prior = self.prior_block()[:rows, :rows]
+        spread = torch.where(outside[..., None], prior, spread)
         return torch.where(outside, grown, mean), spread
 
 

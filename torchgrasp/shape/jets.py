@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.geometry.linalg import Points
 from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries, separations
 
 
@@ -116,6 +117,21 @@ def evaluate_jet(
     slope = _sum_differences(c, x, of.x) - normals
     variance = of.kernel.profile(x.new_zeros(len(x), 1))[:, 0] - explained
     return *mean, variance, -2.0 * slope
+
+
+def rows_at(
+    known: Points,
+    near: int,
+    kernel: Kernel,
+    x: Queries,
+) -> CovarianceRows:
+    """Return the covariance of the distances at q normalised points with all observations.
+
+    The first `near` of the observed points `known` have normals.
+    """
+    d, r = separations(x, known)
+    k, first = kernel.derivatives(r, 2)
+    return distance_rows(d, k, first, near)
 
 
 def distance_rows(

@@ -19,7 +19,7 @@ from torchgrasp.foundation.rules import is_known
 from torchgrasp.geometry.linalg import Points, norm
 from torchgrasp.shape import jets
 from torchgrasp.shape.estimate import JointEstimate, MeanAndGradient, MeanJet, Moments, SurfaceJet
-from torchgrasp.shape.jets import Weighted, distance_rows
+from torchgrasp.shape.jets import Weighted
 from torchgrasp.shape.kernel import (
     CovarianceRows,
     Kernel,
@@ -29,7 +29,6 @@ from torchgrasp.shape.kernel import (
     gram,
     is_plain,
     is_thin,
-    separations,
 )
 
 
@@ -250,9 +249,7 @@ class Posterior(Value):
             k, first = differentiate(self.kernel.profile, (d * d).sum(-1) / 2, 2)
             slope = (first[..., None] * d)[:, : self.n_oriented]
             return torch.cat([k, -slope.mT.flatten(1)], 1)
-        d, r = separations(x, self.x)
-        k, first = self.kernel.derivatives(r, 2)
-        return distance_rows(d, k, first, self.n_oriented)
+        return self._jets(x).rows_at(self.x, self.n_oriented, self.kernel, x)
 
     @checked(gradients=True)
     def whiten(self, rows: CovarianceRows) -> CovarianceRows:

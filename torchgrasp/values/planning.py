@@ -131,6 +131,7 @@ class ShapeEstimate(Value):
             distance.
         variance: variance (*b,) of the distance, in squared normalised units.
         covariance: covariance (*b, 4, 4) of distance (index 0) and gradient (1 to 3), normalised.
+            None if `predict` was called with `covariance=False`.
         std_m: calibrated standard deviation (*b,) [m] of the surface along its normal. It is
             `ShapeGP.std_factor` sqrt(variance) / |gradient| times `ShapeGP.scale`; the gradient is
             that of the mean distance.
@@ -139,7 +140,7 @@ class ShapeEstimate(Value):
     distance: Float[Tensor, "*b"]
     normal: Float[Tensor, "*b 3"]
     variance: Float[Tensor, "*b"]
-    covariance: Float[Tensor, "*b 4 4"]
+    covariance: Float[Tensor, "*b 4 4"] | None
     std_m: Float[Tensor, "*b"]
 
 
