@@ -28,6 +28,7 @@ from torchgrasp.foundation.base import Value, named_tensors
 from torchgrasp.foundation.errors import MissingExtra
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.mesh_distance import MeshSurface
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.motion import _clearance
@@ -117,6 +118,29 @@ def test_jets_of_a_thin_plate(shape, both):
             wanted, found = [wanted], [found]
         for one, other in zip(found, wanted, strict=True):
             assert_close(one, other)
+
+
+@pytest.mark.parametrize("size", [(2, 2), (9, 7)])
+def test_distances_from_an_open_mesh(both, size):
+    """Few samples are one leaf of the tree, many are not filled evenly; points touch the mesh."""
+    lines = [0.03 * torch.linspace(-1.0, 1.0, k, dtype=torch.float64) for k in size]
+    x, y = torch.meshgrid(*lines, indexing="ij")
+    vertices = torch.stack([x, y, 4.0 * x * y], -1).reshape(-1, 3)
+    first = torch.arange(len(vertices)).reshape(size)[:-1, :-1].reshape(-1, 1)
+    corners = [0, size[1], size[1] + 1, 0, size[1] + 1, 1]
+    faces = (first + torch.tensor(corners)).reshape(-1, 3)
+    points = torch.cat([0.08 * random(30, 3), vertices, vertices[faces[:4]].mean(1)])
+    for far in (False, True):
+
+        def distance(far: bool = far) -> torch.Tensor:
+            surface = MeshSurface(vertices, faces)
+            return torch.from_numpy(surface.distance(points.numpy(), far))
+
+        wanted, found = both(distance)
+        assert_close(found.abs(), wanted.abs())
+        apart = wanted.abs() > 1e-9
+        assert apart.sum() >= 30
+        assert_close(found[apart], wanted[apart])
 
 
 @pytest.mark.parametrize("tips_touch", [True, False])

@@ -8,11 +8,8 @@ from tests.make import field_of_mesh, real
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.field_batch import FieldBatch
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.geometry.signed_distance import (
-    SignedDistanceField,
-    field_from_surface,
-    surface_distance,
-)
+from torchgrasp.geometry.mesh_distance import surface_distance
+from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
 from torchgrasp.hand.self_collision import box_distance
 
 

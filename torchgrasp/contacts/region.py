@@ -20,8 +20,8 @@ from torchgrasp.foundation.rules import Fraction, Pose, show
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.geometry.mesh_distance import surface_distance
 from torchgrasp.geometry.plane import Plane, as_plane
-from torchgrasp.geometry.signed_distance import surface_distance
 from torchgrasp.scene.scene import Scene
 from torchgrasp.values.planning import PointCloud
 

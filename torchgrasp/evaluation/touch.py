@@ -15,7 +15,7 @@ from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.foundation.rules import ANY, Length
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import Points, norm
-from torchgrasp.geometry.signed_distance import surface_distance
+from torchgrasp.geometry.mesh_distance import surface_distance
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps, PointCloud
 

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -13,10 +12,9 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.linalg import norm, number_rows
-from torchgrasp.geometry.mesh import closest_on_triangles
+from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.mesh_distance import MeshSurface
 
 FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an estimated surface
 # A cubic in the middle of four equidistant values has this times the weights -1, 9, 9, -1.
@@ -35,24 +33,6 @@ class FieldNumbers:
     """Distance inside the surface, in spacings, within which every node is exact."""
     most_nodes: float = 2e7
     """Most nodes of a grid: 160 MB."""
-    least_area: float = 1e-14
-    """Least area [m2] of a triangle that counts."""
-    sample: float = 0.002
-    """Side [m] of the square for which the surface has one sample on average."""
-    least_samples: int = 2000
-    """Least samples of a surface."""
-    most_samples: int = 40_000
-    """Most samples of a surface, which bounds the time."""
-    few: int = 8
-    """For nodes beyond the band, one in this number of samples is used."""
-    tried: int = 3
-    """Number of triangles that are tried for a point within the band."""
-    leaf: int = 32
-    """Samples in a leaf of the search tree."""
-    at_once: int = 8192
-    """Points whose distances are sought at once, which bounds memory."""
-    digits: int = 9
-    """Decimals [m] in which the corners of neighbouring triangles agree."""
 
 
 FIELDS = FieldNumbers()
@@ -231,7 +211,7 @@ def field_from_surface(
     for more than `FIELDS.most_nodes` nodes.
     """
     check_tensor("vertices", vertices, (None, 3))
-    surface = _Surface(vertices, faces)
+    surface = MeshSurface(vertices, faces)
     low = vertices.amin(0).double() - margin
     high = vertices.amax(0).double() + margin
     # the first nodes are every fourth of the finest
@@ -257,15 +237,6 @@ def field_from_surface(
     return SignedDistanceField(low.to(**to), float(spacing), torch.tensor(values, **to))
 
 
-def surface_distance(vertices: Tensor, faces: Tensor) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that maps points (n, 3) [m] to their signed distances (n,) [m] from a mesh.
-
-    The mesh has outward faces: `vertices` (v, 3) [m], and `faces` (f, 3), the indices of three
-    vertices each.
-    """
-    return _Surface(vertices, faces).distance
-
-
 def _refine(values: np.ndarray) -> np.ndarray:
     """Return signed distances on a grid twice as fine; new nodes have cubic distances and the
     previous node's sign.
@@ -276,106 +247,31 @@ def _refine(values: np.ndarray) -> np.ndarray:
     for axis in range(3):
         sign = _upsample(sign, axis)
         distance = _upsample(distance, axis)
-    return np.where(sign, -distance, distance)
+    return np.negative(distance, out=distance, where=sign)
 
 
 def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
     """Return values with a new one between any two neighbours on an axis: cubic, or for signs the
     previous value.
     """
-    known = np.moveaxis(values, axis, 0)
-    fine = np.empty((2 * len(known) - 1, *known.shape[1:]), dtype=known.dtype)
-    fine[::2] = known
-    if known.dtype == bool:
-        fine[1::2] = known[:-1]
-    else:
-        before = 2 * known[:1] - known[1:2]
-        after = 2 * known[-1:] - known[-2:-1]
-        padded = np.concatenate([before, known, after])
-        inner = 9 * (known[:-1] + known[1:])
-        fine[1::2] = (inner - padded[:-3] - padded[3:]) * SIXTEENTH
-    # queries would copy another layout each time
-    return np.ascontiguousarray(np.moveaxis(fine, 0, axis))
 
+    def at(*ends: int | None) -> tuple[slice, ...]:
+        return (*[slice(None)] * axis, slice(*ends))
 
-class _Surface:
-    """The triangles of a mesh [m], with a search tree over samples of the surface, to find
-    distances to it.
-    """
-
-    def __init__(self, vertices: Tensor, faces: Tensor):
-        if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or faces.is_floating_point():
-            found = f"{faces.dtype} of shape {tuple(faces.shape)}"
-            raise BadArgument("faces", found, "integers (f, 3) with f >= 1")
-        if faces.min() < 0 or faces.max() >= len(vertices):
-            found = f"faces {int(faces.min())}..{int(faces.max())}"
-            raise BadArgument("faces", found, f"0..{len(vertices) - 1}")
-        corners = vertices.detach().cpu().double().numpy()[faces.cpu().numpy()]  # (f, 3, 3)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        double_area = np.linalg.norm(normals, axis=1)
-        kept = double_area / 2 > FIELDS.least_area
-        if not kept.any():
-            raise BadArgument("faces", "faces without area", "a surface")
-        corners = corners[kept]
-        area = double_area[kept] / 2
-        self.triangles = corners
-        self.normals = _pseudonormals(corners, normals[kept] / double_area[kept, None])
-        rng = np.random.default_rng(0)
-        wanted = area.sum() / FIELDS.sample**2
-        count = int(np.clip(wanted, FIELDS.least_samples, FIELDS.most_samples))
-        owner = np.repeat(np.arange(len(area)), rng.multinomial(count, area / area.sum()))
-        u, v = np.sort(rng.random((2, len(owner))), axis=0)
-        weights = np.stack([u, v - u, 1 - v], 1)
-        samples = (corners[owner] * weights[:, :, None]).sum(1)
-        samples = np.concatenate([corners.mean(1), samples])
-        self.owner = np.concatenate([np.arange(len(area)), owner])
-        self.tree = spatial.KDTree(samples, leafsize=FIELDS.leaf)
-        self.few = spatial.KDTree(samples[:: FIELDS.few], leafsize=FIELDS.leaf)
-
-    def distance(self, points: np.ndarray, far: bool = False) -> np.ndarray:
-        """Return the signed distances [m] of points (n, 3); `far` uses fewer samples, for distant
-        points.
-        """
-        parts = []
-        tree = self.few if far else self.tree
-        owners = self.owner[:: FIELDS.few] if far else self.owner
-        tried = 1 if far else min(FIELDS.tried, len(owners))
-        for begin in range(0, max(1, len(points)), FIELDS.at_once):
-            part = points[begin : begin + FIELDS.at_once]
-            _, index = tree.query(part, k=tried)
-            owner = owners[index.reshape(len(part), tried)]  # (p, t)
-            triangles = self.triangles[owner.reshape(-1)]
-            feet, feature = closest_on_triangles(np.repeat(part, tried, 0), triangles)
-            gap = part[:, None] - feet.reshape(*owner.shape, 3)  # (p, t, 3)
-            squared = (gap * gap).sum(-1)
-            rows = np.arange(len(part))
-            best = squared.argmin(1)
-            normal = self.normals[owner[rows, best], feature.reshape(owner.shape)[rows, best]]
-            sign = (gap[rows, best] * normal).sum(1)
-            parts.append(np.copysign(np.sqrt(squared[rows, best]), sign))
-        return np.concatenate(parts)
-
-
-def _pseudonormals(corners: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Return pseudonormals (Baerentzen and Aanaes, 2005) of each triangle's face, 3 sides and 3
-    corners, (f, 7, 3), given the unit normals of the faces (f, 3).
-    """
-    # corners at the same place, to some digits, are one vertex
-    places = np.round(corners.reshape(-1, 3) * 10.0**FIELDS.digits)
-    ids = number_rows(torch.from_numpy(places)).numpy().reshape(-1, 3)
-    ahead = np.roll(corners, -1, 1) - corners
-    back = np.roll(corners, 1, 1) - corners
-    lengths = np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1)
-    cosine = (ahead * back).sum(-1) / lengths
-    weighted = face[:, None] * np.arccos(np.clip(cosine, -1, 1))[..., None]
-    at_corner = _sum_by(ids.reshape(-1), weighted.reshape(-1, 3))
-    ends = np.sort(np.stack([ids, np.roll(ids, -1, 1)], -1), -1)  # (f, 3, 2)
-    number = ends[..., 0] * (ids.max() + 1) + ends[..., 1]
-    side = np.unique(number, return_inverse=True)[1].reshape(-1, 3)
-    at_side = _sum_by(side.reshape(-1), np.repeat(face, 3, 0))
-    return np.concatenate([face[:, None], at_side[side], at_corner[ids]], 1)
-
-
-def _sum_by(number: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return one row per number: the sum of the vectors (n, 3) that have this number."""
-    return np.stack([np.bincount(number, weights=column) for column in vectors.T], 1)
+    shape = list(values.shape)
+    shape[axis] = 2 * shape[axis] - 1
+    fine = np.empty(shape, dtype=values.dtype)
+    fine[at(None, None, 2)] = values
+    if values.dtype == bool:
+        fine[at(1, None, 2)] = values[at(None, -1)]
+        return fine
+    # a straight line beyond the ends
+    before = 2 * values[at(0, 1)] - values[at(1, 2)]
+    after = 2 * values[at(-1, None)] - values[at(-2, -1)]
+    middle = 9 * (values[at(None, -1)] + values[at(1, None)])
+    middle[at(0, 1)] -= before
+    middle[at(1, None)] -= values[at(None, -2)]
+    middle[at(None, -1)] -= values[at(2, None)]
+    middle[at(-1, None)] -= after
+    fine[at(1, None, 2)] = middle * SIXTEENTH
+    return fine

@@ -19,7 +19,7 @@ from benchmarks.plan.pace import keep_pace
 from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.data import read_object_mesh, read_view
 from torchgrasp.foundation.errors import GraspError
-from torchgrasp.geometry.signed_distance import surface_distance
+from torchgrasp.geometry.mesh_distance import surface_distance
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface

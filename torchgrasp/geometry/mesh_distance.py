@@ -1,0 +1,209 @@
+"""Exact signed distances to a triangle mesh, which may be open: to the nearest of a few triangles
+that samples of the surface tell.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.fused import is_fused
+from torchgrasp.foundation.lazy import spatial
+from torchgrasp.geometry.linalg import number_rows
+from torchgrasp.geometry.mesh import closest_on_triangles
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshDistanceNumbers:
+    """Parameters of the search of the triangle that is nearest to a point."""
+
+    least_area: float = 1e-14
+    """Least area [m2] of a triangle that counts."""
+    sample: float = 0.002
+    """Side [m] of the square for which the surface has one sample on average."""
+    least_samples: int = 2000
+    """Least samples of a surface."""
+    most_samples: int = 40_000
+    """Most samples of a surface, which bounds the time."""
+    few: int = 8
+    """For nodes beyond the band, one in this number of samples is used."""
+    tried: int = 3
+    """Number of triangles that are tried for a point within the band."""
+    leaf: int = 32
+    """Samples in a leaf of the search tree."""
+    at_once: int = 8192
+    """Points whose distances are sought at once, which bounds memory."""
+    digits: int = 9
+    """Decimals [m] in which the corners of neighbouring triangles agree."""
+    box: int = 32
+    """Most samples in a leaf of the tree of boxes, which compiled loops search."""
+
+
+MESH_DISTANCE = MeshDistanceNumbers()
+
+
+def surface_distance(vertices: Tensor, faces: Tensor) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that maps points (n, 3) [m] to their signed distances (n,) [m] from a mesh.
+
+    The mesh has outward faces: `vertices` (v, 3) [m], and `faces` (f, 3), the indices of three
+    vertices each.
+    """
+    return MeshSurface(vertices, faces).distance
+
+
+class MeshSurface:
+    """The triangles of a mesh [m], with samples of the surface, to find distances to it."""
+
+    def __init__(self, vertices: Tensor, faces: Tensor):
+        if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or faces.is_floating_point():
+            found = f"{faces.dtype} of shape {tuple(faces.shape)}"
+            raise BadArgument("faces", found, "integers (f, 3) with f >= 1")
+        index = faces.cpu().numpy()  # (f, 3)
+        if index.min() < 0 or index.max() >= len(vertices):
+            found = f"faces {index.min()}..{index.max()}"
+            raise BadArgument("faces", found, f"0..{len(vertices) - 1}")
+        corners = vertices.detach().cpu().double().numpy()  # (v, 3)
+        triangles = corners[index]  # (f, 3, 3)
+        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        double_area = np.linalg.norm(normals, axis=1)
+        kept = double_area / 2 > MESH_DISTANCE.least_area
+        if not kept.any():
+            raise BadArgument("faces", "faces without area", "a surface")
+        triangles = triangles[kept]
+        area = double_area[kept] / 2
+        unit_normals = normals[kept] / double_area[kept, None]
+        self.triangles = triangles
+        self.normals = _pseudonormals(triangles, _places(corners)[index[kept]], unit_normals)
+        rng = np.random.default_rng(0)
+        wanted = area.sum() / MESH_DISTANCE.sample**2
+        count = int(np.clip(wanted, MESH_DISTANCE.least_samples, MESH_DISTANCE.most_samples))
+        owner = np.repeat(np.arange(len(area)), rng.multinomial(count, area / area.sum()))
+        u, v = np.sort(rng.random((2, len(owner))), axis=0)
+        weights = np.stack([u, v - u, 1 - v], 1)
+        samples = (triangles[owner] * weights[:, :, None]).sum(1)
+        self.samples = np.concatenate([triangles.mean(1), samples])
+        self.owner = np.concatenate([np.arange(len(area)), owner])
+
+    @cached_property
+    def every(self) -> "Samples":
+        """All samples of the surface."""
+        return Samples(self.samples, self.owner)
+
+    @cached_property
+    def few(self) -> "Samples":
+        """One sample in some, for distant points."""
+        return Samples(self.samples[:: MESH_DISTANCE.few], self.owner[:: MESH_DISTANCE.few])
+
+    def distance(self, points: np.ndarray, far: bool = False) -> np.ndarray:
+        """Return the signed distances [m] of points (n, 3); `far` uses fewer samples, for distant
+        points.
+        """
+        samples = self.few if far else self.every
+        tried = 1 if far else min(MESH_DISTANCE.tried, len(self.owner))
+        if is_fused():
+            from torchgrasp.geometry import fused_distance  # it imports numba
+
+            return fused_distance.distance(points, samples.boxes, self, tried)
+        parts = []
+        for begin in range(0, max(1, len(points)), MESH_DISTANCE.at_once):
+            part = points[begin : begin + MESH_DISTANCE.at_once]
+            _, index = samples.tree.query(part, k=tried)
+            owner = samples.owner[index.reshape(len(part), tried)]  # (p, t)
+            triangles = self.triangles[owner.reshape(-1)]
+            feet, feature = closest_on_triangles(np.repeat(part, tried, 0), triangles)
+            gap = part[:, None] - feet.reshape(*owner.shape, 3)  # (p, t, 3)
+            squared = (gap * gap).sum(-1)
+            rows = np.arange(len(part))
+            best = squared.argmin(1)
+            normal = self.normals[owner[rows, best], feature.reshape(owner.shape)[rows, best]]
+            sign = (gap[rows, best] * normal).sum(1)
+            parts.append(np.copysign(np.sqrt(squared[rows, best]), sign))
+        return np.concatenate(parts)
+
+
+class Boxes(NamedTuple):
+    """A balanced tree of boxes around the samples of a surface, for compiled loops.
+
+    The root is box 1, and box i holds boxes 2 i and 2 i + 1. The last l boxes are leaves. There is
+    no box 0.
+    """
+
+    low: np.ndarray  # least coordinates (2 l, 3) [m] of the samples in a box
+    high: np.ndarray  # greatest coordinates (2 l, 3) [m]
+    samples: np.ndarray  # points (l, s, 3) [m] of each leaf; NaN fills the last of them up
+    owner: np.ndarray  # triangle (l, s) of each sample
+
+
+class Samples:
+    """Points (s, 3) [m] of a surface and their triangles (s,), to find the nearest of them."""
+
+    def __init__(self, points: np.ndarray, owner: np.ndarray):
+        self.points = points
+        self.owner = owner
+
+    @cached_property
+    def tree(self) -> Any:
+        """The search tree of the points."""
+        return spatial.KDTree(self.points, leafsize=MESH_DISTANCE.leaf)
+
+    @cached_property
+    def boxes(self) -> Boxes:
+        """The same points in a tree of boxes, each of which is halved across its longest side."""
+        count = len(self.points)
+        leaves = 2 ** max(math.ceil(math.log2(count / MESH_DISTANCE.box)), 0)
+        missing = -count % leaves
+        # NaN comes last, and is neither the least nor the greatest of several
+        points = np.pad(self.points.T, ((0, 0), (0, missing)), constant_values=np.nan)
+        owner = np.pad(self.owner, (0, missing))
+        low = []
+        high = []
+        for boxes in 2 ** np.arange(leaves.bit_length()):
+            points = points.reshape(3, boxes, -1)
+            owner = owner.reshape(boxes, -1)
+            low.append(np.fmin.reduce(points, 2))
+            high.append(np.fmax.reduce(points, 2))
+            if boxes < leaves:
+                longest = (high[-1] - low[-1]).argmax(0)
+                along = np.take_along_axis(points, longest[None, :, None], 0)[0]
+                order = np.argpartition(along, along.shape[1] // 2, 1)
+                points = np.take_along_axis(points, order[None], 2)
+                owner = np.take_along_axis(owner, order, 1)
+        low, high = (np.concatenate([each[0], *each], 1).T for each in (low, high))
+        return Boxes(low.copy(), high.copy(), points.transpose(1, 2, 0).copy(), owner)
+
+
+def _places(corners: np.ndarray) -> np.ndarray:
+    """Return a number (v,) for each corner (v, 3) [m]; corners at the same place have the same."""
+    places = np.round(corners * 10.0**MESH_DISTANCE.digits)
+    return number_rows(torch.from_numpy(places)).numpy()
+
+
+def _pseudonormals(corners: np.ndarray, ids: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Return pseudonormals (Baerentzen and Aanaes, 2005) of each triangle's face, 3 sides and 3
+    corners, (f, 7, 3).
+
+    `corners` (f, 3, 3) are those of the triangles, `ids` (f, 3) tell which of them are one vertex,
+    and `face` (f, 3) are the unit normals of the triangles.
+    """
+    ahead = np.roll(corners, -1, 1) - corners
+    back = np.roll(corners, 1, 1) - corners
+    lengths = np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1)
+    cosine = (ahead * back).sum(-1) / lengths
+    weighted = face[:, None] * np.arccos(np.clip(cosine, -1, 1))[..., None]
+    at_corner = _sum_by(ids.reshape(-1), weighted.reshape(-1, 3))
+    ends = np.sort(np.stack([ids, np.roll(ids, -1, 1)], -1), -1)  # (f, 3, 2)
+    number = ends[..., 0] * (ids.max() + 1) + ends[..., 1]
+    side = np.unique(number, return_inverse=True)[1].reshape(-1, 3)
+    at_side = _sum_by(side.reshape(-1), np.repeat(face, 3, 0))
+    return np.concatenate([face[:, None], at_side[side], at_corner[ids]], 1)
+
+
+def _sum_by(number: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return one row per number: the sum of the vectors (n, 3) that have this number."""
+    return np.stack([np.bincount(number, weights=column) for column in vectors.T], 1)
