@@ -12,12 +12,7 @@ import torch
 from tests.make import directions
 from tests.pinch import pinch
 from torchgrasp import ClosingReference, closing_gains, load_hand
-from torchgrasp.control.finger_forces import (
-    contacts_in_hand,
-    desired_forces,
-    joint_stiffness,
-    tip_compliance,
-)
+from torchgrasp.control.finger_forces import contacts_in_hand, desired_forces, tip_compliance
 from torchgrasp.control.law import (
     FORCE_BANDWIDTH,
     FORCE_FLOOR,
@@ -38,6 +33,7 @@ from torchgrasp.control.paper.stability import load_stability
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.hand.drives import joint_stiffness
 
 
 def draw(*shape, seed=0):

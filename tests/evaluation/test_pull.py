@@ -11,11 +11,11 @@ import torch
 from tests.make import near, real
 from tests.pinch import cylinder, pinch
 from torchgrasp.control import squeeze
-from torchgrasp.control.finger_forces import joint_stiffness
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullSpec, Truth, lift_grasps, pull_grasp
 from torchgrasp.evaluation.trial import TrialRun
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.hand.drives import joint_stiffness
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 MASS = 0.05

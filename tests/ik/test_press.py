@@ -100,7 +100,6 @@ def test_strength_and_stiffness_follow_from_virtual_work(name):
     jacobian = differences(hand, postures)
     drives = [hand.actuators[joint] for joint in hand.joint_names]
     effort = torch.tensor([drive.effort for drive in drives]).double()
-    kp = torch.tensor([drive.kp for drive in drives]).double()
     # at its strength, some joint of a pressing finger has its greatest torque, and none has more
     torque = jacobian[:, :, 2].abs() * postures.strength[:, None, None]
     most = (torque / effort).amax(2)
@@ -108,6 +107,11 @@ def test_strength_and_stiffness_follow_from_virtual_work(name):
     near(most, torch.ones_like(most), 1e-6)
     assert float(postures.strength.min()) >= PRESS.weakest
     assert float(postures.strength.max()) <= PRESS.strongest
+    # the drives of all joints that follow an actuated one resist its motion
+    rest = hand.expand_joints(torch.zeros(hand.dof).double())
+    moves = hand.expand_joints(torch.eye(hand.dof).double()) - rest  # (h, j)
+    drives = torch.tensor([hand.actuators[joint].kp for joint in hand.tree.joint_names]).double()
+    kp = moves**2 @ drives
     # a unit force on a tip bends joints, gears and links
     stiffness = postures.stiffness
     near(stiffness, stiffness.mT, 1e-6 * float(stiffness.abs().max()))

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.regrasp import smooth_step
+from torchgrasp.control.smooth import smooth_step
 from torchgrasp.control.tactile import Observation, Targets
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status

@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.balance import least_friction_forces
-from torchgrasp.control.finger_forces import drive_efforts
 from torchgrasp.control.held_object import LOAD, FrictionEstimate, LoadEstimate, likely_body
 from torchgrasp.control.law import TINY
 from torchgrasp.control.least_forces import Balance, LeastForces, balance, friction_ratios
@@ -22,6 +21,7 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation, smooth
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.linalg import norm
+from torchgrasp.hand.drives import drive_efforts
 from torchgrasp.values.distribution import Distribution
 
 MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a sensor reads too little

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.control.finger_forces import drive_efforts
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import NOISE, Observation
+from torchgrasp.hand.drives import drive_efforts
 
 SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
 POSE_TIME = 0.4  # time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze

@@ -22,6 +22,7 @@ from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.hand.drives import drive_stiffness, joint_stiffness
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import opened_pose
 from torchgrasp.values.closing import ClosingGains, SensorModel
@@ -141,7 +142,7 @@ class ClosingReference(Value):
         sure = math.hypot(law.FORCE_FLOOR, 0.0 if deviation is None else float(deviation.min()))
         covariance = law.surface_covariance(normals, std_m)
         jacobian = hand.jacobian(grasp.joints, points)  # (1, f, 3, h)
-        stiffness = finger_forces.joint_stiffness(hand, kp)
+        stiffness = joint_stiffness(hand, kp)
         compliance = finger_forces.tip_compliance(jacobian, normals, stiffness)
         force_covariance = law.force_covariance(desired, normals, deviation)
         force_rate = law.FORCE_BANDWIDTH * sure**2 * compliance
@@ -158,7 +159,7 @@ class ClosingReference(Value):
         direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
         return cls(
             hand,
-            finger_forces.drive_stiffness(hand, kp),
+            drive_stiffness(hand, kp),
             obj_from_hand=grasp.obj_from_hand[0],
             pregrasp=grasp.pregrasp[0],
             joints=grasp.joints[0],

@@ -270,11 +270,3 @@ class Withdrawal:
             share, rate = smooth_step(min((k + 1) / ticks, 1.0))
             self.speed = self.length * rate / (ticks * self.period)
             yield Targets(opening.opened, opening.palm, self.length * share)
-
-
-def smooth_step(time: float) -> tuple[float, float]:
-    """Return (position, speed) of a motion from 0 to 1 that starts and ends at rest.
-
-    The `time` is in [0, 1]; all are without unit.
-    """
-    return time * time * (3 - 2 * time), 6 * time * (1 - time)

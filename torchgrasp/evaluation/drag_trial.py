@@ -13,7 +13,6 @@ from torch import Tensor
 
 from torchgrasp.cloud.agreement import AGREEMENT, check_contacts, check_stand
 from torchgrasp.control.drag import DRAGGING, DragController
-from torchgrasp.control.finger_forces import drive_stiffness
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.data.shipped import GraspObject, solid_of
 from torchgrasp.evaluation.frame import rounded, rounded_table, world_frame
@@ -30,6 +29,7 @@ from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.hand.drives import drive_stiffness
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.drag_plan import DragPlan
 from torchgrasp.planner.edge import EdgePlan

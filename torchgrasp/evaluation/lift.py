@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.agreement import check_contacts, check_stand
 from torchgrasp.control.reference import check_single
-from torchgrasp.control.regrasp import smooth_step
+from torchgrasp.control.smooth import smooth_step
 from torchgrasp.data.shipped import GraspObject, solid_of
 from torchgrasp.evaluation.criterion import Tick, judge_lift, motion_between
 from torchgrasp.evaluation.trial import (

@@ -14,13 +14,12 @@ from torch import Tensor
 from torchgrasp.cloud.agreement import AGREEMENT, check_contacts
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.control.controller import GraspController
-from torchgrasp.control.finger_forces import drive_efforts
 from torchgrasp.control.holding import GripHold
 from torchgrasp.control.modes import choose_preference
 from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
-from torchgrasp.control.regrasp import smooth_step
 from torchgrasp.control.relook import REACH
+from torchgrasp.control.smooth import smooth_step
 from torchgrasp.evaluation.frame import rounded_table, to_frame, world_frame
 from torchgrasp.evaluation.protocols import apply_error, draw_trial, seed_of
 from torchgrasp.evaluation.true_scene import (
@@ -38,6 +37,7 @@ from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.hand.drives import drive_efforts
 from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene

@@ -7,11 +7,11 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.finger_forces import stiff_drives
 from torchgrasp.evaluation.frame import moved_mesh, rounded_table
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.hand.drives import stiff_drives
 from torchgrasp.hand.hand import Hand
 from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene_spec import Body, SceneSpec, edge_of

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.agreement import check_contacts
-from torchgrasp.control.finger_forces import stiff_drives
 from torchgrasp.control.holding import PUSH
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.postures import named_postures, quaternion
@@ -27,6 +26,7 @@ from torchgrasp.foundation.rules import Positive
 from torchgrasp.geometry.frames import inverse, rotation_from_rpy
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane, upright_frame
+from torchgrasp.hand.drives import stiff_drives
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import Joint, Link, LinkShape
 from torchgrasp.ik.motion import opened_pose

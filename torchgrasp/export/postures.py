@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.control.finger_forces import Squeeze, squeeze, stiff_drives
+from torchgrasp.control.finger_forces import Squeeze, squeeze
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.files import format_json
 from torchgrasp.foundation.checks import checked
@@ -19,6 +19,7 @@ from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Force, Pose, Positive
 from torchgrasp.geometry.frames import rotate
+from torchgrasp.hand.drives import stiff_drives
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.urdf import read_urdf

@@ -24,6 +24,7 @@ from torchgrasp.geometry.linalg import (
     perpendicular,
     unit,
 )
+from torchgrasp.hand.drives import joint_stiffness
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.sample import sample_configurations
 
@@ -250,12 +251,12 @@ def _stiffness(
 ) -> Float[Tensor, "p f 3 3"]:
     """Return the stiffness [N/m] of each fingertip, turned into the posture's frame.
 
-    It is the inverse of the compliance J K^-1 J^T, for the Jacobian J and the joints' stiffness K,
-    plus that of gears and links. `feet` [m] are the tips' lowest points in the hand's frame.
+    It is the inverse of the compliance J K^-1 J^T, for the Jacobian J and the joints' stiffness K
+    with that of coupled joints, plus that of gears and links. `feet` [m] are the tips' lowest
+    points in the hand's frame.
     """
     jacobian = turn[:, None] @ hand.jacobian(joints, feet)  # (p, f, 3, h)
-    kp = jacobian.new_tensor([hand.actuators[name].kp for name in hand.joint_names])
-    compliance = (jacobian / kp) @ jacobian.mT
+    compliance = (jacobian / joint_stiffness(hand).to(jacobian)) @ jacobian.mT
     return torch.linalg.inv(compliance + PRESS.compliance * eye_like(3, jacobian))
 
 

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.balance import grasp_map, internal_forces
-from torchgrasp.control.finger_forces import coupled_stiffness
 from torchgrasp.control.holding import RAMP, held_forces, regulate
 from torchgrasp.control.law import (
     MAX_SPEED,
@@ -27,6 +26,7 @@ from torchgrasp.control.tactile import STILL, Observation, smooth
 from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
 from torchgrasp.geometry.linalg import limit_norm, norm
+from torchgrasp.hand.drives import coupled_stiffness
 
 STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (Sec. 6.5).
 # stiffness of the virtual frame [N/m, N m/rad]
