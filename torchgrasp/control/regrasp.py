@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchgrasp.control.controller import GraspController, Period
 from torchgrasp.control.recovery import LiftCheck, Reopening
+from torchgrasp.control.smooth import smooth_step
 from torchgrasp.control.tactile import Observation, Targets
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.checks import checked
