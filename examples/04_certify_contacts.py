@@ -8,7 +8,7 @@ import torch
 
 from torchgrasp import Contacts, ContactSpec, certify, load_hand, load_mixture, solve_ik
 
-# Three contacts around a can of radius 33 mm, the third one opposite the first two, and three on
+# Three contacts around a can of radius 33 mm, the third one opposite the first two. Then three on
 # one side of it.
 angles = (
     torch.tensor([[20.0, -20.0, 180.0], [40.0, 0.0, -40.0]], dtype=torch.float64) * math.pi / 180

@@ -1,5 +1,5 @@
-"""From an exported grasp to a joint trajectory at 250 Hz, in the order and with the stiffness of
-the hand's driver.
+"""From an exported grasp to a joint trajectory at 250 Hz. It has the order and the stiffness of the
+hand's driver.
 
 hands/README.md tells order, zeros and stiffness for each shipped hand. Here it is Wonik's driver of
 the Allegro hand.

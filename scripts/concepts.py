@@ -1,6 +1,6 @@
 #!/usr/bin/env python
-"""Draw the pictures of docs/concepts.md and docs/edge.md: a slice through a band of uncertainty,
-contacts with and without closure, and a drag.
+"""Draw the pictures of docs/concepts.md and docs/edge.md. They show a slice through a band of
+uncertainty, contacts with and without closure, and a drag.
 
 python scripts/concepts.py [--out docs]
 """

@@ -4,9 +4,9 @@
     .venv/bin/python -m pip install cosmic-ray==8.7.0
     .venv/bin/python scripts/mutants.py --folders shape contacts --each 50 --out mutants.json
 
-Cosmic Ray makes the mutants. Each runs in a copy of the repository: first the test file of the
-mutated module, then the other tests of its folder. A mutant that no test notices has survived. It
-needs a test, or it changes no behaviour.
+Cosmic Ray makes the mutants. Each runs in a copy of the repository. The test file of the mutated
+module runs first, then the other tests of its folder. A mutant that no test notices has survived.
+It needs a test, or it changes no behaviour.
 """
 
 import json

@@ -1,6 +1,6 @@
 #!/usr/bin/env python
-"""Build wheel and sdist of the last commit, and try the wheel in an empty environment of every
-Python there is.
+"""Build wheel and sdist of the last commit. Try the wheel in an empty environment of every Python
+there is.
 
     python scripts/package.py                                 with all Pythons that are found
     python scripts/package.py --python python3.10 python3.13  with these; with none it only builds

@@ -3,8 +3,8 @@
 
     .venv/bin/python scripts/sensitivity.py --objects DIR --out sensitivity.json
 
-Numbers are the constants of modules, and the fields of options values: frozen dataclasses whose
-names end in Numbers or Layout, with their default instances.
+Numbers are the constants of modules, and the fields of options values. These are frozen dataclasses
+whose names end in Numbers or Layout, with their default instances.
 
 A number whose change alters no plan and no closing has no effect on these objects. It is removed,
 or its reason is a case that these objects do not have. The first case that differs ends the search

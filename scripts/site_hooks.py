@@ -124,7 +124,7 @@ def _notebook(text: str, stem: str) -> tuple[str, dict[str, bytes]]:
 
 
 def _relink(text: str, folder: Path, up: str = "") -> str:
-    """Replace links from a file in a folder of the project by links of the site; `up` leads to the
+    """Replace links from a file in a folder of the project by links of the site. `up` leads to the
     site's root.
     """
 

@@ -77,8 +77,8 @@ def prepare(
 ) -> LimitedClosing:
     """Return the closing of a grasp, whose strongest finger presses with `force` [N].
 
-    Raises `BadArgument` for more than one grasp, for one that failed a check or is of another hand,
-    and for a force that needs more than the limits.
+    Raises `BadArgument` for more than one grasp, and for one that failed a check or is of another
+    hand. Raises it also for a force that needs more than the limits.
     """
     if len(grasp) != 1:
         raise BadArgument("grasp", f"{len(grasp)} grasps", "one grasp, as grasps[:1]")
@@ -111,8 +111,8 @@ def close_open_loop(
     """Go from where the hand is to the pre-grasp, the grasp and the squeeze; return how it ended.
 
     That is "held", with the drives pressing on, or why the hand was stopped. The hand is stopped
-    within a tick when `stop` is set, when a reading is old or no number, when a joint is blocked
-    before the squeeze, and by any error.
+    within a tick when `stop` is set, and when a reading is old or no number. It is also stopped
+    when a joint is blocked before the squeeze, and by any error.
     """
     reach = closing.limits / closing.kp
     ended = "stopped by an error"

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Close an Allegro or a LEAP hand on a planned grasp, and hold: joint states come in, joint
+"""Close an Allegro or a LEAP hand on a planned grasp, and hold. Joint states come in, joint
 commands go out.
 
 `HandLoop` holds what the node does with messages; it needs no ROS. Neither hand feels with its
-fingertips: the loop takes what a drive exerts beyond the free motion, stiffness times lag, as the
+fingertips. The loop takes what a drive exerts beyond the free motion, stiffness times lag, as the
 torque of a contact.
 """
 

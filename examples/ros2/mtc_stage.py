@@ -129,7 +129,7 @@ def _state(types: messages.Types, names: Sequence[str], positions: Any, header: 
 def make_stage(core: Any, states: Sequence[GraspStates], group: str, name: str = "grasps") -> Any:
     """Return an MTC generator that offers each grasp as an interface state.
 
-    The hand is at the pre-grasp there. The state has `target_pose`, which ComputeIK reads, and
+    The hand is at the pre-grasp there. The state has `target_pose`, which ComputeIK reads. It has
     `pregrasp`, `grasp` and `squeeze`, where MTC's Python takes a RobotState as a property. Costs
     are those of the states. Set the monitored stage, which gives the scene: `setMonitoredStage`.
     `group` is that of the hand's joints.

@@ -27,14 +27,14 @@ RESULTS = ROOT / "docs" / "results"
 SPEED = RESULTS / "speed.md"
 CHANGED = " with changes"
 UNKNOWN = "unknown"
-"""What stands behind a commit if the working tree differs from it, and what stands for a commit
+"""What stands behind a commit if the working tree differs from it. Then what stands for a commit
 that git does not tell.
 """
 Result = TypeVar("Result")
 
 
 def mean_over(values: Iterable[tuple[str, float]]) -> Share:
-    """Return the mean, with its 95 % interval, of values given as pairs of unit name and value; NaN
+    """Return the mean, with its 95 % interval, of values given as pairs of unit name and value. NaN
     is left out.
     """
     return contrast_over([sum_by(values)], [1.0])

@@ -18,7 +18,7 @@ HIDDEN = 0.006
 """Distance [m] from the cloud beyond which the true surface counts as hidden."""
 TABLE_FACE = 0.002
 DOWNWARD = -0.7
-"""Height [m] over the lowest point, and upward part of the normal, below which surface is the face
+"""Height [m] over the lowest point, and upward part of the normal. Below both, surface is the face
 on the table.
 """
 
@@ -45,8 +45,8 @@ def read_cameras(folder: Path) -> dict[str, dict[str, Float[Tensor, "n 3"]]]:
 
 
 def sample_hidden(mesh: trimesh.Trimesh, cloud: PointCloud, n: int) -> Float[Tensor, "k 3"]:
-    """Return those of n random points of a mesh [m] that a cloud does not show; the face on the table
-    is left out.
+    """Return those of n random points of a mesh [m] that a cloud does not show. The face on the
+    table is left out.
     """
     points, faces = trimesh.sample.sample_surface(mesh, n, seed=0)[:2]
     low = mesh.bounds[0, 2] + TABLE_FACE

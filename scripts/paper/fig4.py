@@ -36,8 +36,8 @@ def fig4(out: Path, seed: int = 0) -> None:
     deviation.
 
     Two shapes are of the partial cloud: with the paper's observations, and with torchgrasp's own.
-    Arrows are the points that a shape observes on the surface, of the cloud and of its completion,
-    with its normals.
+    Arrows are the points that a shape observes on the surface, with its normals. They are of the
+    cloud and of its completion.
 
     Args:
         out: folder of fig4.png; it is made where it does not exist.
@@ -47,7 +47,7 @@ def fig4(out: Path, seed: int = 0) -> None:
     for name in list_objects():
         thing = load_object(name)
         clouds = (sample_whole(thing.mesh, seed), thing.view)
-        # Exact normals are observed as they are: new ones would mix the two sides of thin walls, 6
+        # Exact normals are observed as they are. New ones would mix the two sides of thin walls, 6
         # mm between points.
         whole = fit_shape(clouds[0], budget=BUDGET, support="paper", seed=seed)
         paper = fit_shape(clouds[1], support="paper", seed=seed)
@@ -60,7 +60,7 @@ def fig4(out: Path, seed: int = 0) -> None:
             told = f"median {std.median():.1f}, 99 % {std.quantile(0.99):.1f}"
             print(f"{name:10}{kind:9} std [mm]: {told}")
         scenes.append((thing, clouds, surfaces, arrows))
-    # One scale for all, the most certain 80 % of each: the least certain bulges would leave all
+    # One scale for all, the most certain 80 % of each. The least certain bulges would leave all
     # else in one colour.
     every = [surface for _, _, surfaces, _ in scenes for surface in surfaces]
     most = 1e3 * max(float(surface.std_m.quantile(0.8)) for surface in every)

@@ -1,4 +1,4 @@
-"""Figs. 9 to 12 of the paper: contacts that hands take, in more than one way and with more than one
+"""Figs. 9 to 12 of the paper. Contacts that hands take, in more than one way and with more than one
 hand.
 """
 
@@ -59,8 +59,8 @@ class Taken:
 
 
 def grasps(out: Path, starts: int = 1000, seed: int = 0, only: tuple[str, ...] = ()) -> None:
-    """Draw Figs. 9 to 12 with the project's objects: the hands on the shapes that one side of each
-    object gives.
+    """Draw Figs. 9 to 12 with the project's objects. The hands are on the shapes that one side of
+    each object gives.
 
     fig9.png: one contact triple by two postures of the same hand. fig10.png: one triple by both
     hands. fig11.png and fig12.png: grasps of the Barrett and of the Allegro hand. All are planned
@@ -117,7 +117,7 @@ def unlike_pair(taken: Taken) -> tuple[Taken, int, int, float] | None:
 
 
 def shared_triple(first: Taken, other: Hand) -> list[tuple[Taken, int]]:
-    """Return a grasp of each hand on one triple: on those that the first hand takes, the other hand
+    """Return a grasp of each hand on one triple. On those that the first hand takes, the other hand
     is tried, too.
     """
     surface = first.surface

@@ -1,4 +1,4 @@
-"""The values of the tables: what is planned and lifted in a row, what a campaign is made of, and
+"""The values of the tables: what is planned and lifted in a row, what a campaign is made of. Also
 what came of it.
 """
 
@@ -17,8 +17,8 @@ Support = Literal["camera", "paper"]
 
 @dataclasses.dataclass(frozen=True)
 class Row(Value):
-    """A row of a table: its name, the support of the shape, S_thresh of the contacts (`variance`),
-    and how the hand closes and holds.
+    """A row of a table: its name, the support of the shape, and S_thresh of the contacts
+    (`variance`). Also how the hand closes and holds.
 
     The grasps with the greatest sum of variances come first (Sec. 6.5).
     """

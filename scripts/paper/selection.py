@@ -1,5 +1,5 @@
 """How many Gaussians: the information criterion of separate fits, the reference of `growing_bic`,
-and cross-validation (Fig. 6 and footnote 4 of the paper).
+and cross-validation. See Fig. 6 and footnote 4 of the paper.
 """
 
 import dataclasses

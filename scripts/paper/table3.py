@@ -1,5 +1,5 @@
-"""Table 3 of the paper with the objects of torchgrasp: how many points the filter keeps, and how
-long shapes take.
+"""Table 3 of the paper with the objects of torchgrasp. It has how many points the filter keeps, and
+how long shapes take.
 """
 
 import json
@@ -33,11 +33,11 @@ PUBLISHED = {
 
 
 def table3(out: Path, seed: int = 0) -> None:
-    """Print Table 3: points that the filter keeps of a cloud, seconds of the filter and of the
-    shape given its points.
+    """Print Table 3: points that the filter keeps of a cloud, and seconds. The seconds are those of
+    the filter and of the shape given its points.
 
-    "paper" is the filter of Sec. 3.1 on 1000 points of the whole surface and on the partial cloud:
-    the most uncertain point is observed until none has a variance above the noise. "default" is
+    "paper" is the filter of Sec. 3.1 on 1000 points of the whole surface and on the partial cloud.
+    The most uncertain point is observed until none has a variance above the noise. "default" is
     what torchgrasp does with the partial cloud: a fixed number of points, the outline and the
     mirrored cloud.
 

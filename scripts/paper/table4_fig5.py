@@ -57,7 +57,7 @@ def table4(out: Path, starts: int = 1000, seed: int = 0) -> None:
     ours.
 
     "paper" plans the paper's problem (Eqs. 10-14, starts on a sphere of 0.1) on the paper's
-    observations of the partial cloud; "default" is what torchgrasp does by itself. Only certified
+    observations of the partial cloud. "default" is what torchgrasp does by itself. Only certified
     grasps count.
 
     Args:
@@ -118,8 +118,8 @@ def fig5(out: Path, starts: int = 300, seed: int = 0) -> None:
     deviation.
 
     Each object has a column of the paper's problem on the paper's shape, and one of torchgrasp's
-    own. Of the certified grasps the better half counts: of the paper's the more certain ones, of
-    the others the more probable ones. Drawn are those unlike each other.
+    own. Of the certified grasps the better half counts. Of the paper's these are the more certain
+    ones, of the others the more probable ones. Drawn are those unlike each other.
 
     Args:
         out: folder of fig5.png; it is made where it does not exist.

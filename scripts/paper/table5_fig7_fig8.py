@@ -2,7 +2,8 @@
 (Eq. 23).
 
 Test postures can hold something and touch where their tips have rolled to. Beside them stand the
-same postures that touch with the middles of their pads, and uniform postures, as the paper tested.
+same postures that touch with the middles of their pads. Uniform postures stand there, too, as the
+paper tested.
 """
 
 import dataclasses

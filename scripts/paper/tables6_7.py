@@ -84,8 +84,8 @@ def table6(spec: Asked) -> None:
 
 
 def table7(spec: Asked) -> None:
-    """Print Table 7: how often the same grasps hold, closed in five ways, held alike and as each
-    closing does itself.
+    """Print Table 7: how often the same grasps hold, closed in five ways. They are held alike, and
+    as each closing does itself.
 
     The riskiest grasps below the first threshold are lifted.
 

@@ -1,8 +1,8 @@
 """Fit the factors of `std_m`, and try them on families of objects left out.
 
 The posterior's own deviations are too wide where much is known, and too narrow where a wrong plane
-looks right. The factor of a kind is the one with which 1, 2 and 3 `std_m` hold what they say, in
-the mean over views.
+looks right. The factor of a kind makes 1, 2 and 3 `std_m` hold what they say, in the mean over
+views.
 """
 
 from collections.abc import Sequence

@@ -1,5 +1,5 @@
-"""Bodies as diverse as a household, any number of them, each with its convex parts: for fits that
-need many shapes.
+"""Bodies as diverse as a household, any number of them, each with its convex parts. They are for
+fits that need many shapes.
 
 The families cycle. Sizes are drawn anew for each body, 15 to 250 mm in all. No body is decomposed:
 its parts are known by construction, and its mesh is their union. Nothing fitted on them has seen a
@@ -52,8 +52,8 @@ GOLDEN_ANGLE = 137.5
 
 @dataclasses.dataclass(frozen=True)
 class HouseholdBody:
-    """A body [m] that rests on z = 0 above the origin: its closed mesh, and the convex parts that
-    fill it.
+    """A body [m] that rests on z = 0 above the origin. It has a closed mesh, and the convex parts
+    that fill it.
     """
 
     name: str

@@ -32,7 +32,7 @@ class Trials(NamedTuple):
     """Trials: `features` (n, k), whether each `passed`, its family, rank and hand.
 
     `beside` (n, m, k) holds the features of all grasps that were tried on the body, for the task of
-    the trial, with NaN where there are fewer than m. `place` says which of them the trial tried.
+    the trial. It is NaN where there are fewer than m. `place` says which of them the trial tried.
     """
 
     features: Array

@@ -1,7 +1,7 @@
 """The shapes of torchgrasp's own objects from exact geometry; `author_objects.py` writes them.
 
 Every object is a union of convex solids, so its convex parts need no decomposition. A physics
-engine takes at most 255 corners and 255 faces, so curved parts are coarser than the mesh; they have
+engine takes at most 255 corners and 255 faces. So curved parts are coarser than the mesh; they have
 the same volume. The module needs manifold3d, a dependency of development only. Metres, z up,
 resting at z = 0.
 """
@@ -75,8 +75,8 @@ def _rabbit() -> tuple[m3.Manifold, list[m3.Manifold]]:
 
 
 def _spray() -> tuple[m3.Manifold, list[m3.Manifold]]:
-    """A spray bottle: an oval body of 70 x 54 mm, a neck, and a trigger head that sprays along x;
-    232 mm high.
+    """A spray bottle, 232 mm high: an oval body of 70 x 54 mm, a neck, and a trigger head. It
+    sprays along x.
     """
     profile = [(0.029, 0), (0.033, 0.004), (0.035, 0.020)]
     profile += [(0.035, 0.090), (0.0335, 0.110), (0.029, 0.130)]
@@ -103,8 +103,8 @@ def _spray() -> tuple[m3.Manifold, list[m3.Manifold]]:
 
 
 def _jug() -> tuple[m3.Manifold, list[m3.Manifold]]:
-    """A full jug: 152 mm high, 78 mm wide, filled to 14 mm below the rim, a spout along x, a handle
-    behind.
+    """A full jug: 152 mm high, 78 mm wide, filled to 14 mm below the rim. A spout is along x, a
+    handle behind.
     """
     outline = [(0.030, 0), (0.034, 0.004), (0.037, 0.025)]
     outline += [(0.039, 0.050), (0.0385, 0.070), (0.036, 0.090)]

@@ -31,7 +31,7 @@ def paper_model(
 ) -> None:
     """Learn the posture model that `plan_grasps(mode="paper")` asks by Eq. (21).
 
-    Most random postures are wide open, so a model of all of them knows few triples of the size of
+    Most random postures are wide open. So a model of all of them knows few triples of the size of
     an object. Here every size, the mean distance of the fingertips from their centre, is equally
     likely.
 

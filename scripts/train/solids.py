@@ -37,7 +37,7 @@ MERGED = 1e-3
 ROCKING = 1.0
 """Between two faces on which a body lies alike [deg]: it rocks, but does not tip over."""
 STEADY = 4.0
-"""A body tips over when it is tilted by more than this [deg]; a lying rod of 24 sides rolls at 7.5.
+"""A body tips over when it is tilted by more than this [deg]. A lying rod of 24 sides rolls at 7.5.
 """
 
 
@@ -232,8 +232,8 @@ def path(
 def arc(
     radius: float | tuple[float, float], start: float, end: float, count: int, at: Sequence[float]
 ) -> np.ndarray:
-    """Return points (count, 3) of a circle or ellipse in the plane of x and z, between two angles
-    [deg] from x to z.
+    """Return points (count, 3) of a circle or ellipse in the plane of x and z. They lie between two
+    angles [deg] from x to z.
     """
     x, z = radius if isinstance(radius, tuple) else (radius, radius)
     angle = np.radians(np.linspace(start, end, count))
@@ -295,7 +295,7 @@ def unite(thing: Thing) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:
 
 def find_rest(mesh: trimesh.Trimesh) -> np.ndarray:
     """Return the least turn (4 x 4) that lays a body steadily on a face of its hull, or on its
-    steadiest face.
+    steadiest.
 
     >>> find_rest(trimesh.creation.box((1, 1, 1))).tolist() == np.eye(4).tolist()
     True

@@ -1,4 +1,4 @@
-"""What a grasp is asked to do in a trial: pulls or a lift, and the numbers that decide whether it
+"""What a grasp is asked to do in a trial: pulls or a lift. Also the numbers that decide whether it
 holds.
 """
 
@@ -98,8 +98,8 @@ def draw_friction(draw: np.random.Generator) -> float:
 
 
 def draw_ordinary(draw: np.random.Generator, planned: float) -> Task:
-    """Draw the task of a grasp for which a promise is made: at the planned friction, where the
-    planner saw the object.
+    """Draw the task of a grasp for which a promise is made. It has the planned friction, and the
+    object is where the planner saw it.
 
     >>> draw_ordinary(np.random.default_rng(0), 0.6).mass <= ORDINARY_MASS[1]
     True

@@ -1,12 +1,12 @@
-"""Trials of the predicted success: grasps of all ranks on authored household bodies, each tried
+"""Trials of the predicted success: grasps of all ranks on authored household bodies. Each is tried
 with a task of its own.
 
 One job is one body and one hand. It is planned on from a noisy view and its grasps are tried in
 MuJoCo. The jobs of a hand are a campaign (`torchgrasp.campaign`): the same call continues an
 interrupted run. Tasks are kept as metadata.
 
-For promises, the best grasp for each of a few ordinary tasks is tried instead, on families that fit
-no model.
+For promises, the best grasp for each of a few ordinary tasks is tried instead. The bodies are of
+families that fit no model.
 """
 
 import dataclasses
@@ -135,8 +135,8 @@ def trials(
         first: number of the first body, so that more bodies can follow in a folder of their own.
         best: try the best grasp for ordinary tasks, on bodies of the families that calibrate the
             model.
-        objects: folder of objects that are tried in place of household bodies: each with each hand,
-            then all again from another side.
+        objects: folder of objects that are tried in place of household bodies. Each is tried with
+            each hand, then all again from another side.
         names: objects of this folder; by default all.
     """
     shelf = None if objects is None else Shelf(objects, names or tuple(read_entries(objects)))
@@ -219,7 +219,7 @@ def try_body(
     best: bool = False,
     shelf: Shelf | None = None,
 ) -> bytes:
-    """Plan on one view of a body, try its grasps, and return the bytes of a shard with this job
+    """Plan on one view of a body, and try its grasps. Return the bytes of a shard with this job
     alone.
     """
     check_versions(meta)

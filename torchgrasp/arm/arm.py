@@ -1,8 +1,8 @@
 """A robot arm that carries a hand: its chain of joints, its collision spheres, and random postures
 to start from.
 
-A posture is one position [rad, or m for sliding joints] of each of the n joints, from the base to
-the tip. The tip is the link that carries the hand.
+A posture is one position of each of the n joints, from the base to the tip. Positions are in [rad],
+or in [m] for sliding joints. The tip is the link that carries the hand.
 """
 
 import dataclasses
@@ -78,9 +78,9 @@ class Arm(Value):
         pairs: indices (p, 2) of the spheres of each pair that must not overlap. Pairs of adjacent
             links, and pairs that overlap by construction, are left out.
         library: m random postures (m, n) [rad or m], from which inverse kinematics starts.
-        features: the tip's pose in each posture of the library as twelve numbers (m, 12) [mm]: its
-            position, then the entries of its rotation matrix times 71 mm. The Euclidean distance of
-            two rows is a distance of two poses.
+        features: the tip's pose in each posture of the library as twelve numbers (m, 12) [mm]. They
+            are its position, then the entries of its rotation matrix times 71 mm. The Euclidean
+            distance of two rows is a distance of two poses.
         hand_sha256: SHA-256 of the files of the hand, by which `plan_grasps` knows it.
     """
 
@@ -219,9 +219,9 @@ def load_arm(
             gets this range.
         hand: the hand on the arm, or its name, or its folder.
         tip: name of the link that carries the hand. None means the link that is moved by the most
-            joints; of several such links it is the last in the file.
+            joints. Of several such links it is the last in the file.
         obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the cloud that is
-            planned on; None means the identity.
+            planned on. None means the identity.
         tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip; None means
             the identity.
         seed: seed of the random postures from which inverse kinematics starts.

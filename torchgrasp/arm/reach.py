@@ -1,9 +1,10 @@
 """Inverse kinematics of an arm: which hand poses it reaches, and its way through a grasp.
 
-Postures are moved by damped least squares until the hand is in place: first those of the arm's
-library whose tips are nearest, then along a way each from the one before. A way is w poses of the
-hand: the straight approach of the opened hand, the grasp, the lift. g counts grasps, k postures or
-poses, and n the joints of the arm, whose positions are in [rad, or m for sliding joints].
+Postures are moved by damped least squares until the hand is in place. The first are those of the
+arm's library whose tips are nearest. Along a way, each posture starts from the one before. A way is
+w poses of the hand: the straight approach of the opened hand, the grasp, the lift. Here g counts
+grasps, k postures or poses, and n the joints of the arm. Positions of joints are in [rad], or in
+[m] for sliding joints.
 """
 
 import dataclasses
@@ -56,8 +57,8 @@ class ReachNumbers:
 
 REACH = ReachNumbers()
 Way = tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"], Float[Tensor, "g 2"]]
-"""The w postures [rad or m] on the way through each grasp, a mask of the grasps with a way, and the
-ease of the way, as in `Grasps`.
+"""The w postures [rad or m] on the way through each grasp. Also a mask of the grasps with a way,
+and the ease of the way, as in `Grasps`.
 """
 
 
@@ -100,12 +101,12 @@ def follow_grasps(
 ) -> Way:
     """Return the arm's way through each grasp; it is zero if there is none.
 
-    The results are the w postures of the way [rad or m], a mask of the grasps that have a way, and
-    the ease of the way: the least columns of `measure_ease`. The way goes through the easiest
-    posture that reaches the grasp, and from which the arm can follow the whole way. The arm follows
-    without a jump and within its joint limits. Its links collide neither with the `world`, nor with
-    each other or the palm.
-    If the `world` has no table, the hand is lifted along the unit vector `up`.
+    The results are the w postures of the way [rad or m], and a mask of the grasps that have a way.
+    The third is the ease of the way: the least columns of `measure_ease`. The arm can follow the
+    whole way from some of the postures that reach the grasp. The way goes through the easiest of
+    these. The arm follows without a jump and within its joint limits. Its links collide neither
+    with the `world`, nor with each other or the palm. If the `world` has no table, the hand is
+    lifted along the unit vector `up`.
     """
     poses = way_of(hand, grasps, world, up).to(arm.lower)
     starts = REACH.starts
@@ -171,8 +172,8 @@ def track(
     without jumps.
 
     `start` are the postures at the grasps, one in each column. `tips` are the poses (3 x 4) [m] of
-    the tip in the base's frame at all w places. On a way without a jump every pose is reached, and
-    no joint moves faster than it can at the hand's speed.
+    the tip in the base's frame at all w places. On a way without a jump every pose is reached. No
+    joint moves faster than it can at the hand's speed.
     """
     at = COARSE_STEPS + 1
     path = {at: start}
@@ -189,8 +190,8 @@ def track(
 
 
 def _is_clear(arm: Arm, path: Float[Tensor, "g w n"], world: CollisionWorld) -> Bool[Tensor, "g"]:
-    """Return a mask of the ways on which no link touches the world; on whole ways also no other
-    link or the palm.
+    """Return a mask of the ways on which no link touches the world. On whole ways no link touches
+    another link or the palm, either.
     """
     centres = arm.sphere_centres(path.flatten(0, 1).T).unflatten(2, path.shape[:2])
     links = centres[:, arm.moving].permute(2, 3, 1, 0)
@@ -257,9 +258,9 @@ def solve_tips(
     in place.
 
     `start` holds a posture in each column, `target` the poses [m] of the tips in the base's frame.
-    A tip is in place if the sum of its squared errors is below `solved` [mm2], by default that of a
-    hundredth of a millimetre; a posture makes at most `steps` steps. The damping is half the
-    squared error (Sugihara, IEEE Transactions on Robotics 27, 2011).
+    A tip is in place if the sum of its squared errors is below `solved` [mm2]. By default `solved`
+    is that of a hundredth of a millimetre. A posture makes at most `steps` steps. The damping is
+    half the squared error (Sugihara, IEEE Transactions on Robotics 27, 2011).
     """
     joints = start.clone()
     rows = torch.arange(start.shape[1], device=start.device)

@@ -192,7 +192,7 @@ def _request(objects: Path, hand: Hand, spec: CampaignSpec) -> dict[str, Any]:
 
 
 def _list_jobs(objects: Path, spec: CampaignSpec) -> tuple[JobRow, ...]:
-    """Return one row for each job (a view of an object), in order; an object with a bad entry gives
+    """Return one row for each job (a view of an object), in order. An object with a bad entry gives
     a single row.
     """
     rows: list[JobRow] = []

@@ -32,12 +32,12 @@ def run_on_cluster(
     """Run tasks on a Dask cluster, and yield the index and the result of each as it ends.
 
     A task holds the arguments of `function`; `address` is that of the scheduler. A task whose
-    worker dies is given to another worker; after the deaths that the scheduler allows
-    (`distributed.scheduler.allowed-failures`, 3 by default) it gives `Status.WORKER_DIED`. A task
-    that takes longer than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. The scheduler
-    holds `OUTSTANDING` tasks at most, which wait until a worker is free. An argument `OnGpu` that
-    successive tasks share is computed once. Without Dask, `MissingExtra` is raised; without a
-    scheduler at the address, `BadArgument`.
+    worker dies is given to another worker. After the deaths that the scheduler allows it gives
+    `Status.WORKER_DIED`. The setting is `distributed.scheduler.allowed-failures`, 3 by default. A
+    task that takes longer than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. The
+    scheduler holds `OUTSTANDING` tasks at most, which wait until a worker is free. An argument
+    `OnGpu` that successive tasks share is computed once. Without Dask, `MissingExtra` is raised;
+    without a scheduler at the address, `BadArgument`.
     """
     try:
         from distributed import CancelledError, Client, Event, KilledWorker, as_completed
@@ -94,7 +94,7 @@ def run_on_cluster(
 def _bounded(
     function: Callable[..., Result], limit: float, name: str, *task: Any
 ) -> Result | Status:
-    """Call a function on one thread of a worker process; end the process if the call takes longer
+    """Call a function on one thread of a worker process. End the process if the call takes longer
     than `limit` [s].
     """
     from distributed import Event

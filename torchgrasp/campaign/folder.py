@@ -1,4 +1,4 @@
-"""The folder of a campaign: one file for each finished job until its shard is complete, and the
+"""The folder of a campaign: one file for each finished job until its shard is complete. Also the
 data set's cards.
 """
 
@@ -23,14 +23,14 @@ PARTS = "parts"
 incomplete shards.
 """
 ROUNDS = 3
-"""How often a job whose process died is tried in one call, because a dying process also ends jobs
-beside its own.
+"""How often a job whose process died is tried in one call. A dying process also ends jobs beside
+its own.
 """
 FAILED = (Status.WORKER_DIED, Status.TIMED_OUT, Status.BROKEN)
 """Statuses of a failed job that say nothing about its object: the next call tries the job again."""
 Work = Callable[[Sequence[int]], Generator[tuple[int, bytes | Status], None, None]]
-"""Function of job indices that yields, as each job ends, a position in these indices, and a file or
-a failure.
+"""Function of job indices that yields a pair as each job ends. It is a position in these indices,
+and a file or a failure.
 """
 
 
@@ -68,8 +68,9 @@ def carry_out(
     """Run the jobs that a folder lacks, and write its data set, which is returned.
 
     `work` runs jobs, given their indices. As each job ends, it yields the job's place among these
-    indices, and the bytes of its shard or a failure. `observer` is called with the `JobRow` of each
-    finished job. Raises `OutputError` if the folder holds another campaign or other files.
+    indices. With it come the bytes of its shard or a failure. `observer` is called with the
+    `JobRow` of each finished job. Raises `OutputError` if the folder holds another campaign or
+    other files.
     """
     with hold_folder(folder):
         begin_folder(folder / ASKED, campaign.text, "campaigns")

@@ -66,15 +66,15 @@ def run_job(
     plans: object = None,
     place: int = 0,
 ) -> bytes:
-    """Plan and try the grasps of one job, a `view`; return the bytes of a shard file with only this
+    """Plan and try the grasps of one job, a `view`. Return the bytes of a shard file with only this
     job.
 
     `protocol` is the test of each grasp, and `spec` says which grasps are tried. `meta` holds the
-    `versions` of the software with which the campaign began; every machine must have them, and the
+    `versions` of the software with which the campaign began. Every machine must have them, and the
     same hand. `plans` is what `plan_jobs` returned, and the job's plan is `plans[place]`. If it is
-    no list (None, or the `Status` of a planning that took too long), the job is planned here. A
-    faulty object gives a `JobRow` with the reason. Errors that are not the object's fault are
-    raised.
+    no list, the job is planned here. This is None, or the `Status` of a planning that took too
+    long. A faulty object gives a `JobRow` with the reason. Errors that are not the object's fault
+    are raised.
     """
     check_versions(meta)
     hand = view.load_hand()

@@ -29,7 +29,7 @@ class AdviceNumbers:
     narrow: float = 0.06
     """Least width [m] of a level plane that counts as a table left in the cloud."""
     afloat: float = 0.06
-    """Greatest height [m] of an object's lowest point above its table without advice: cameras lose
+    """Greatest height [m] of an object's lowest point above its table without advice. Cameras lose
     the points just above a table, and things before it hide more.
     """
     level: float = 0.97
@@ -87,8 +87,7 @@ def judge_view(
     if cloud.viewpoint is not None and cloud.normals is not None:
         facing = share_facing(cloud.points, cloud.normals, cloud.viewpoint)
     seeing = eye if facing >= FACING else None
-    # An estimate may be on the wrong side of a table, but not where it is the origin of a camera's
-    # frame.
+    # An estimate may be on the wrong side of a table. The origin of a camera's frame is not.
     trusted = seeing if seeing is None or given or not bool(seeing.any()) else None
     support = find_ground(points, trusted, up, ADVICE.narrow)
     ground = None if support is None else support.plane
@@ -127,7 +126,7 @@ def check_camera(clean: PointCloud) -> None:
 
 
 def _judge_facing(facing: float) -> Advice | None:
-    """Return advice if too few normals face the camera: nearly all do in a single view, half on a
+    """Return advice if too few normals face the camera. Nearly all do in a single view, half on a
     whole surface.
     """
     if facing < 1 - FACING:
@@ -147,8 +146,8 @@ def _judge_backward(
 ) -> Advice | None:
     """Return advice if points lie before a camera in the origin that looks along -z, as OpenGL's.
 
-    `points` are (n, 3) [m]; the `viewpoint` (3,) or (n, 3) [m] is None if it is unknown, and `up`
-    (3,) is the unit vector that points up.
+    `points` are (n, 3) [m]. The `viewpoint` (3,) or (n, 3) [m] is None if it is unknown. `up` (3,)
+    is the unit vector that points up.
     """
     elsewhere = viewpoint is not None and bool(viewpoint.any())
     if elsewhere or float(up[2]) <= ADVICE.z_up:

@@ -33,8 +33,8 @@ class AgreementNumbers:
     share: float = 0.2
     """Greatest share of points that may be farther from their mesh."""
     beside: float = 0.0005
-    """Greatest median distance [m] of points from their mesh without a warning, in addition to the
-    noise and the error of the camera's pose. Views of rendered sensors are nearer to their mesh,
+    """Greatest median distance [m] of points from their mesh without a warning. The noise and the
+    error of the camera's pose are added to it. Views of rendered sensors are nearer to their mesh,
     those of a similar object farther.
     """
     guessed: float = 0.4
@@ -67,10 +67,11 @@ def check_agreement(
     share: float,
 ) -> float:
     """Return the median distance [m] of points from a mesh, or from a cloud and the space behind
-    it; raise `BadArgument` if they lie off it.
+    it. Raise `BadArgument` if they lie off it.
 
     At most the fraction `share` of the `points` (n, 3) [m] may be farther than `slack` [m] from
-    `other`, the mesh [m] or the cloud. Errors call the argument `name`, and its points `what`.
+    `other`. This is the mesh [m] or the cloud. Errors call the argument `name`, and its points
+    `what`.
     """
     points = points.detach().cpu().double()
     points = points[draw_rows(len(points), AGREEMENT.drawn)]
@@ -94,9 +95,9 @@ def check_agreement(
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
     """Raise `BadArgument` if many points of an object's cloud do not lie on the object's mesh.
 
-    The mesh [m] is in the frame of the cloud. Errors call it by `name`. The warning
-    `CloudWarning` tells that most points are farther from it than noise and pose error explain, as
-    from the mesh of a similar object.
+    The mesh [m] is in the frame of the cloud. Errors call it by `name`. The warning `CloudWarning`
+    tells that most points are farther from it than noise and pose error explain. An
+    example is the mesh of a similar object.
     """
     noise = noise_of(cloud)
     slack = AGREEMENT.slack + 2 * noise
@@ -114,8 +115,8 @@ def check_contacts(
     slack: float = AGREEMENT.slack,
     share: float = AGREEMENT.guessed,
 ) -> None:
-    """Raise `BadArgument` if more than a `share` of the contacts of grasps are farther than `slack`
-    [m] from their object's mesh.
+    """Raise `BadArgument` if too many contacts of grasps are off their object's mesh: more than a
+    `share`, farther than `slack` [m].
 
     The mesh [m] is in the frame of the grasps. A mesh that floats above the table of the grasps, or
     sinks far into it, is refused, too.

@@ -102,8 +102,8 @@ def partial_view(
     Points and `viewpoint` [m] are in the frame of the mesh. There are no normals. The camera has
     640 x 480 pixels.
 
-    By default the noise is that of an active stereo camera: noisy and rounded disparities, a smooth
-    bias, and flying and missing pixels at rims. Pixels are missing at grazing angles, too.
+    By default the noise is that of an active stereo camera. It has noisy and rounded disparities, a
+    smooth bias, and flying and missing pixels at rims. Pixels are missing at grazing angles, too.
 
     Args:
         mesh: surface of the object [m].
@@ -203,7 +203,7 @@ def _in_image_box(
     y: Float[Tensor, "h"],
 ) -> Bool[Tensor, "h w"]:
     """Return a mask of the camera rays (x, y, 1) that pass through the bounding box of the mesh in
-    the image; `x` are those of its columns, and `y` of its rows.
+    the image. `x` are those of its columns, and `y` those of its rows.
     """
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)

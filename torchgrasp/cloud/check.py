@@ -37,7 +37,7 @@ class CloudNumbers:
     scene: float = 10.0
     """Greatest extent, read as metres, that is taken for a scene in metres or an object in cm."""
     longest: float = 45.0
-    """Greatest extent, read as metres, that is taken for cm, of an object of at most 45 cm; a
+    """Greatest extent, read as metres, that is taken for cm: that of an object of at most 45 cm. A
     larger one is taken for mm.
     """
     farthest: float = 50.0
@@ -57,8 +57,8 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
         TooFewPoints: fewer than 4 distinct points.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m], as of points
             in mm.
-        BadArgument: points that all coincide or lie on one line; a normal of length zero; a camera
-            more than 50 m (`CLOUD.farthest`) away, as one in mm.
+        BadArgument: points that all coincide or lie on one line; a normal of length zero. Also a
+            camera more than 50 m (`CLOUD.farthest`) away, such as one in mm.
 
     >>> check_cloud(PointCloud(torch.rand(50, 3))).viewpoint is None
     True
@@ -129,8 +129,8 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
 
 
 def _check_distinct(points: Points, rows: Int[Tensor, "m"]) -> None:
-    """Raise an error if the distinct points, at the indices `rows`, are too few, or if all points
-    lie on a line.
+    """Raise an error if the distinct points, at the indices `rows`, are too few. Raise one also if
+    all points lie on a line.
     """
     if len(rows) < MIN_POINTS:
         allowed = f"at least {MIN_POINTS} distinct points"
@@ -141,8 +141,8 @@ def _check_distinct(points: Points, rows: Int[Tensor, "m"]) -> None:
 
 
 def _check(cloud: PointCloud) -> Points:
-    """Return the cloud's points, or raise an error if its extent or camera is implausible, or a
-    normal has length zero.
+    """Return the cloud's points. Raise an error if its extent or camera is implausible, or a normal
+    has length zero.
     """
     points = cloud.points
     extent = float((points.amax(0) - points.amin(0)).max())
@@ -167,7 +167,7 @@ def _check(cloud: PointCloud) -> Points:
 
 
 def _guess_unit(extent: float) -> str:
-    """Guess the unit of an extent that is too large or too small to be in metres: objects are 5 to
+    """Guess the unit of an extent that is too large or too small to be in metres. Objects are 5 to
     45 cm long.
     """
     if extent < MIN_EXTENT:

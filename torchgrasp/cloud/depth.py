@@ -45,8 +45,7 @@ class DepthNumbers:
     is another.
     """
     millimetres: float = 200.0
-    """A median depth, read as metres, that is too large is in mm if it is above this, else in
-    cm.
+    """A median depth that is too large for metres is in mm if it is above this, else in cm.
     """
     background: float = 0.05
     """Least share of pixels with the greatest depth, from which this depth, if too far, marks a
@@ -73,8 +72,8 @@ def cloud_from_depth(
     """Return the points [m] that a pinhole camera's depth image shows, in the object frame.
 
     In the camera's frame x points right, y down and z forward. A pixel with depth z in column u and
-    row v shows the point z ((u - cx) / fx, (v - cy) / fy, 1). u and v count from 0. Pixels with
-    depth 0, NaN, 65535 counts or more than 50 m were not measured, and are left out.
+    row v shows the point z ((u - cx) / fx, (v - cy) / fy, 1). Both u and v count from 0. Pixels
+    with depth 0, NaN, 65535 counts or more than 50 m were not measured, and are left out.
 
     The result's `viewpoint` is the camera, and its `frustum` are the sides of the image. Its dtype
     is that of a depth tensor of floats, else float64.
@@ -190,8 +189,8 @@ def read_depth(
 ) -> tuple[Image, Matrix, Bool[Tensor, "h w"] | None, Lens | None]:
     """Check the arguments of `cloud_from_depth`; return depth, intrinsics, mask and distortion.
 
-    The depth (h, w) is in metres, 0 where nothing was measured; the intrinsics (3, 3) are in
-    pixels; the mask (h, w) and the distortion are None without one. Raises `BadArgument` for what
+    The depth (h, w) is in metres, 0 where nothing was measured. The intrinsics (3, 3) are in
+    pixels. The mask (h, w) and the distortion are None without one. Raises `BadArgument` for what
     `cloud_from_depth` refuses.
     """
     k, stated, scale, lens = parse_intrinsics(intrinsics)

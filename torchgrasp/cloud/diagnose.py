@@ -110,8 +110,8 @@ def diagnose_cloud(
     """Return the measured properties of a cloud, with advice on what would improve it.
 
     At most 50,000 points (`DIAGNOSIS.measured`) are measured. At most 5000 of them
-    (`DIAGNOSIS.viewed`) show whether camera, vertical and table are right, and whether there is a
-    second body.
+    (`DIAGNOSIS.viewed`) show whether camera, vertical and table are right. They also show whether
+    there is a second body.
 
     Args:
         cloud: the points [m].

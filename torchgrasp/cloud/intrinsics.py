@@ -62,12 +62,12 @@ class IntrinsicsNumbers:
     unequal: float = 0.05
     """Greatest difference of fx and fy, over fy, of four numbers in their right order."""
     beside: float = 0.1
-    """Greatest shift of the principal point from the middle in four such numbers, as a share of the
-    side of the image.
+    """Greatest shift of the principal point from the middle in four such numbers. It is a share of
+    the side of the image.
     """
     farthest: float = 8.0
-    """Greatest shift of the principal point of a crop from its middle, as a share of the side:
-    beyond it, the point belongs to another image.
+    """Greatest shift of the principal point of a crop from its middle, as a share of the side.
+    Beyond it, the point belongs to another image.
     """
     corner: float = 0.05
     """Greatest distance by which a crop may reach out of its camera's image, as a share of the
@@ -83,11 +83,11 @@ class IntrinsicsNumbers:
     """
     scaled: float = 2.5
     """Ratio of the principal point's coordinates to those of the image's middle, or its inverse.
-    From this ratio on, the same for both sides, the point belongs to an image of another scale; the
+    From this ratio on, the same for both sides, the point belongs to an image of another scale. The
     point of a crop is nearer.
     """
     off: float = 0.16
-    """Shift of the principal point from the middle, over half the side, beyond which another
+    """Shift of the principal point from the middle, over half the side. Beyond it another
     resolution is guessed: few cameras have more.
     """
     agree: float = 0.5
@@ -113,7 +113,7 @@ class Written(NamedTuple):
         size: width and height of the image [pixels].
         scale: metres of one count of the depth.
         window: x, y, width and height of ROS's region of interest [pixels], then the binning in x
-            and y; 0 if not set.
+            and y. Each is 0 if not set.
         lens: distortion of the image; None for a pinhole's.
     """
 
@@ -129,9 +129,9 @@ def parse_intrinsics(
 ) -> tuple[Matrix, list[float] | None, float | None, Lens | None]:
     """Return the matrix (3, 3) [pixels] of intrinsics in any form that `cloud_from_depth` takes.
 
-    Second is the [width, height] of the image [pixels], third the metres of one count of the depth,
-    and fourth the distortion; each is None if it is not stated. Raises `BadArgument` for anything
-    else.
+    Second is the [width, height] of the image [pixels]. Third are the metres of one count of the
+    depth, and fourth is the distortion. Each is None if it is not stated. Raises `BadArgument` for
+    anything else.
     """
     table, size, scale, window, lens = _read_written(value)
     k = as_tensor("intrinsics", table)
@@ -268,8 +268,8 @@ def _find_matrix(value: object) -> tuple[dict[str, Any], str, Any]:
 
 
 def _read_window(named: Mapping[str, Any]) -> list[float]:
-    """Return x, y, width and height of ROS's region of interest [px], and the binning in x and y; 0
-    if not set.
+    """Return x, y, width and height of ROS's region of interest [px], and the binning in x and y.
+    Each is 0 if not set.
     """
     roi = named.get("roi", {})
     region = roi if isinstance(roi, Mapping) else {side: getattr(roi, side, 0) for side in SIDES}

@@ -127,7 +127,7 @@ def read_lens(named: Mapping[str, Any]) -> Lens | None:
     """Return the distortion in the named values of a camera; None if it moves no pixel.
 
     Names are in lower case. Raises `BadArgument` for a model that is no rational polynomial, such
-    as a fisheye's, and for coefficients that are no such model's.
+    as a fisheye's. Raises it also for coefficients that are no such model's.
     """
     lists = [named[name] for name in LISTS if named.get(name) is not None]
     found = {name: named[name] for name in (*NAMES, *OFF_CENTRE) if named.get(name) is not None}

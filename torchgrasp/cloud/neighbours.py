@@ -32,7 +32,7 @@ class NeighbourNumbers:
     """Width of the weights of neighbours, over the distance of the farthest."""
     ridge: float = 1e-3
     """Weight of the squared coefficients of a quadric, other than the constant one, relative to the
-    squared errors: it matters only where points are few.
+    squared errors. It matters only where points are few.
     """
     block: int = 1 << 14
     """Points whose quadrics are fitted at once: bounds the memory for clouds of any size."""
@@ -110,9 +110,9 @@ def fit_local_planes(
 def fit_quadrics(points: Points) -> tuple[Points, Points, Float[Tensor, "n"]]:
     """Fit a quadric around each of n points; return the moved point, the unit normal and the error.
 
-    The point (n, 3) is moved onto the quadric, and the normal (n, 3), of either sign, is that of
-    the quadric there. The rms error has the unit of `points`. Planes would move the points of a
-    ball of radius r inward by s^2 / 2r, where s is the neighbours' spread.
+    The point (n, 3) is moved onto the quadric. The normal (n, 3), of either sign, is that of the
+    quadric there. The rms error has the unit of `points`. Planes would move the points of a ball of
+    radius r inward by s^2 / 2r. Here s is the spread of the neighbours.
     """
     whole = (points, *nearest(points, NEAR.quadric))
     blocks = zip(*(x.split(NEAR.block) for x in whole), strict=True)

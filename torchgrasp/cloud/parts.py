@@ -76,7 +76,7 @@ def label_bodies(points: Points, gap: float = PARTS.gap) -> Int[Tensor, "n"]:
 def find_second_body(points: Points, up: Vector, spacing: float) -> Bool[Tensor, "n"] | None:
     """Return a mask of the points of a second body on the same ground; None if there is none.
 
-    The points (n, 3) are in metres, `up` is the unit vector that points up, and `spacing` [m] is
+    The points (n, 3) are in metres, and `up` is the unit vector that points up. `spacing` [m] is
     the distance between neighbouring points.
     """
     label = label_bodies(points, max(PARTS.gap, PARTS.spacings * spacing))
@@ -106,7 +106,7 @@ def cut_object(
     """Return (object, support): the points of one object of a scene, and the plane it stands on.
 
     The plane is a `Plane` in the frame of the cloud; None if no plane was found. Points below the
-    plane, or up to 4 mm (`PARTS.layer`) above it, are left out; in a noisy cloud more are.
+    plane, or up to 4 mm (`PARTS.layer`) above it, are left out. In a noisy cloud more are left out.
 
     Args:
         cloud: points [m] of a scene.

@@ -62,8 +62,8 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
 
 
 def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
-    """Return a PCD file's header, as a dict of each line's words by its first word, and the data
-    after the header.
+    """Return a PCD file's header and the data after it. The header is a dict of each line's words
+    by its first word.
     """
     header: dict[str, list[str]] = {}
     start = 0
@@ -100,7 +100,7 @@ def decompress(data: bytes, size: int) -> bytes:
     """Return the `size` bytes to which LZF-compressed data expand.
 
     A control byte c < 32 is followed by c + 1 literal bytes. A larger c means a copy of (c >> 5) +
-    2 earlier bytes; a length of 9 is extended by the next byte. The distance back to the copied
+    2 earlier bytes. A length of 9 is extended by the next byte. The distance back to the copied
     bytes has 13 bits. Raises `Malformed` for malformed data.
     """
     out = bytearray()

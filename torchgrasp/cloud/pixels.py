@@ -1,6 +1,6 @@
 """The camera of a view whose pixels were kept: seen from there, the points form a regular lattice.
 
-Noise and steps of depth move a point along its ray, so the lattice stays regular however noisy the
+Noise and steps of depth move a point along its ray. So the lattice stays regular however noisy the
 view is. Clouds that were resampled, averaged or thinned at random show none.
 """
 
@@ -19,7 +19,7 @@ class PixelNumbers:
     """Parameters of the search for the camera from which a cloud is regular.
 
     The irregularity of a camera is the mean deviation of the angles between neighbouring pixels
-    from their median, over the median: about 0 for a lattice, and a third for random points.
+    from their median, over the median. It is about 0 for a lattice, and a third for random points.
     """
 
     least: int = 100
@@ -35,7 +35,7 @@ class PixelNumbers:
     usual: float = 0.6
     """Usual distance [m] of a camera, at which the search begins."""
     rare: float = 0.5
-    """Share by which the irregularity counts as greater at e times this distance, or 1 / e: small
+    """Share by which the irregularity counts as greater at e times this distance, or 1 / e. Small
     things hardly show how far the camera is.
     """
     starts: int = 2
@@ -67,9 +67,9 @@ def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None
     """Return the camera position [m] from which points (n, 3) [m] form a regular lattice of pixels.
 
     It is None if there is no such place. A camera on the opposite side sees nearly the same
-    lattice. So only cameras above are tried, in the direction `up`; if it is None, those on the
-    side to which the surface bulges. The origin, the camera of a cloud in its camera's frame, is
-    tried first.
+    lattice. So only cameras above are tried, in the direction `up`. If it is None, those on the
+    side to which the surface bulges are tried. The origin, the camera of a cloud in its camera's
+    frame, is tried first.
     """
     if len(points) < PIXELS.least:
         return None

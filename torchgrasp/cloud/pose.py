@@ -158,7 +158,7 @@ class LayerNumbers:
     own: float = 0.25
     """Greatest share of points on the table, over the share of the layer."""
     standing: float = 0.01
-    """Least share of points that are higher than a layer above the table: over the flat top of an
+    """Least share of points that are higher than a layer above the table. Over the flat top of an
     object there are none.
     """
 
@@ -274,10 +274,10 @@ def find_plausible(
 ) -> tuple[SupportPlane, ...]:
     """Return the planes on which objects may stand, the most plausible first.
 
-    `points` (n, 3) [m] and the `table`, a plane or a height z [m], are in the frame to which the
-    `pose` leads. `up` is the direction against gravity there; with None, planes may face any way,
-    but level ones, as z of a given pose says, come before walls. `known_unit` is whether the user
-    gave the unit of the depth. Supports that carry the `target` come first. Raises
+    `points` (n, 3) [m] and the `table` are in the frame to which the `pose` leads. The table is a
+    plane or a height z [m]. `up` is the direction against gravity there. With None, planes may face
+    any way. But level ones, as z of a given pose says, come before walls. `known_unit` is whether
+    the user gave the unit of the depth. Supports that carry the `target` come first. Raises
     `BadArgument` for a pose or a unit that the view contradicts, and `NoSupport` if there is no
     plane.
     """
@@ -337,7 +337,7 @@ def check_view(points: Points, pose: Transform, up: object, known_unit: bool) ->
 
 
 def _is_own(pose: Transform) -> bool:
-    """Return whether a pose is nearly the identity, so that the frame is the camera's, where z need
+    """Return whether a pose is nearly the identity. Then the frame is the camera's, where z need
     not be up.
     """
     turn = float(torch.diagonal(pose[:3, :3]).min())
@@ -513,7 +513,7 @@ def tell_furniture(points: Points, labels: Tensor) -> tuple[str, ...]:
 
 
 def _is_scaled(pose: Transform, plane: Plane, height: float) -> bool:
-    """Return whether a wrong unit explains the table's place: counts of 0.25 mm read as millimetres
+    """Return whether a wrong unit explains the table's place. Counts of 0.25 mm read as millimetres
     put a camera four times too high above a table near z = 0.
     """
     if plane.offset >= SIZES.low_table or _is_own(pose):

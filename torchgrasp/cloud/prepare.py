@@ -52,7 +52,7 @@ class NormalNumbers:
     """Signs are not compared below this |cosine|: across an edge of 45 degrees."""
     over: float = 0.3
     """Signs are not compared with a neighbour whose height over the tangent plane, over its
-    distance, is above this: it is behind a thin wall.
+    distance, is above this. Such a neighbour is behind a thin wall.
     """
     pairs: int = 20
     """Fewest pairs of neighbours that count; of fewer any share may be chance."""
@@ -121,13 +121,13 @@ def prepare_cloud(
 
     `generator` draws at most 2000 of the points. Missing normals are fitted. So are normals of
     random signs, with which a single view would look like a whole surface. With `clean`, outliers
-    are removed, the other points are moved onto quadrics fitted around them, and all normals are
+    are removed, and the other points are moved onto quadrics fitted around them. All normals are
     fitted anew. Also with `clean`, a viewpoint that too few given normals face counts as missing.
-    If these are the normals of one side, `NoEffect` warns of it.
-    With `clean`, a missing viewpoint is that of `find_pixel_camera`, if its pixels show it; `up` is
-    the upward direction, or None. Else, and where normals are fitted, it is estimated by
-    `guess_viewpoint`. Raises the errors of `check_cloud`, `BadArgument` for more than 16
-    cameras or normals that point away from the camera, and `TooFewPoints` for a view of fewer than 10 points.
+    If these are the normals of one side, `NoEffect` warns of it. With `clean`, a missing viewpoint
+    is that of `find_pixel_camera`, if its pixels show it. `up` is the upward direction, or None.
+    Else, and where normals are fitted, it is estimated by `guess_viewpoint`. Raises the errors of
+    `check_cloud`. Raises `BadArgument` for more than 16 cameras or normals that point away from the
+    camera. Raises `TooFewPoints` for a view of fewer than 10 points.
     """
     cloud = remove_duplicates(cloud)
     normals = cloud.normals

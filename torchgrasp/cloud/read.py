@@ -107,7 +107,7 @@ def read_cloud(
 
     * `.ply`, ascii or binary: x y z, optionally nx ny nz. Header lines `comment viewpoint x y z`
       and `comment frustum` give the camera. The 12 numbers of a frustum are the inward unit normals
-      of the four sides of the view, as in `PointCloud`. `comment table` gives the table, by the 3
+      of the view's four sides, as in `PointCloud`. `comment table` gives the table, by the 3
       numbers of its unit normal and its offset. A mesh gives 2000 surface points, with normals if
       it is closed.
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z. VIEWPOINT
@@ -154,8 +154,8 @@ def read_cloud_file(
     viewpoint: Sequence[float | int] | Tensor | None = None,
     unit: Literal["m", "cm", "mm"] = "m",
 ) -> CloudFile:
-    """Read a cloud of any extent, such as a whole scene, with its table and notes on what was left
-    out.
+    """Read a cloud of any extent, such as a whole scene. Its table and notes on what was left out
+    come with it.
 
     Formats, arguments and what is left out are those of `read_cloud`.
 
@@ -246,9 +246,9 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
         table: plane of the table in the frame of the cloud, which is written, too. None without
             one.
 
-    Raises `OutputError` if the file cannot be written, and `BadArgument` for another suffix, or for
-    a table with an edge, which neither file can hold.
-    `BadArgument` is also raised for a `.ply` of several views, or of a cloud with `pose_error`.
+    Raises `OutputError` if the file cannot be written. Raises `BadArgument` for another suffix, or
+    for a table with an edge, which neither file can hold. `BadArgument` is also raised for a `.ply`
+    of several views, or of a cloud with `pose_error`.
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
     Traceback (most recent call last):
@@ -365,7 +365,7 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
 
 
 def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dict[str, Any]:
-    """Return arrays in which the table of 3 or 6 columns is split into points and normals; colours
+    """Return arrays in which the table of 3 or 6 columns is split into points and normals. Colours
     are left out.
     """
     table = np.asarray(arrays["columns"])
@@ -411,7 +411,7 @@ def _fit_surface(arrays: dict[str, Any]) -> bool:
 def _find_measured(
     points: Tensor, normals: Tensor | None, notes: list[str]
 ) -> tuple[Tensor, Tensor | None]:
-    """Return a mask of the measured rows, and the normals (None if most are missing); add notes on
+    """Return a mask of the measured rows, and the normals (None if most are missing). Add notes on
     the other rows.
     """
     total = len(points)
@@ -437,7 +437,7 @@ def _find_measured(
 
 
 def _find_repeated(points: Tensor, keep: Tensor, notes: list[str]) -> Tensor:
-    """Return a mask of the rows at one place, if it holds far more rows than other places do; add a
+    """Return a mask of the rows at one place, if it holds far more rows than other places do. Add a
     note on them.
 
     Only the rows of the mask `keep` count. Those at one place are missing pixels: (0, 0, 0), moved

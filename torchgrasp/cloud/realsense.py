@@ -55,8 +55,8 @@ def shoot_depth(serial: str | None = None, numbers: LiveCameraNumbers = SHOT) ->
 
     The mode is the camera's default. `serial` is the number of the camera; None means the only one.
     Raises `MissingExtra` without pyrealsense2, and `BadArgument` if it cannot be loaded. The same
-    is raised if no camera is connected, if none or several fit, if a frame does not come, or if the
-    view moves.
+    is raised if no camera is connected, or if none or several fit. It is raised, too, if a frame
+    does not come, or if the view moves.
     """
     sdk = import_sdk()
     device = _choose(sdk, list_cameras(sdk), serial)

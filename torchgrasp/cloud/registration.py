@@ -3,11 +3,11 @@
 Three decisions matter. First, the distance of two views is that of a motion: the rigid one after
 which they agree best. It is the root mean square, over the points, of how far the motion moves them
 along their normals. So shifts to and from a camera count alike, and turns and scales count. Slides
-along a surface that do not change it count nothing. Cameras need not be known. Second, this motion is a most
-likely one: what the overlap does not show stays as given, since the poses are known to some mm.
-Registration with `align` is the same motion, so a package for it would do less: those that we know
-let a bottle spin about its axis. Third, what a camera saw through is empty: points that another
-view has before a surface contradict it, with or without an overlap.
+along a surface that do not change it count nothing. Cameras need not be known. Second, this motion
+is a most likely one. What the overlap does not show stays as given, since the poses are known to
+some mm. Registration with `align` is the same motion, so a package for it would do less. Those that
+we know let a bottle spin about its axis. Third, what a camera saw through is empty. Points that
+another view has before a surface contradict it, with or without an overlap.
 """
 
 import dataclasses
@@ -57,7 +57,7 @@ class ViewDistanceNumbers:
     likely: float = 1.0
     shown: float = 4.0
     """Least chi squared of a motion that widens the standard deviations, and of one that is
-    reported, corrected or refused: below the second, noise and bias of the cameras explain it.
+    reported, corrected or refused. Below the second, noise and bias of the cameras explain it.
     """
     vague: float = 1.5
     """Factor of the limits for a view without a camera, whose noise is a guess."""
@@ -113,8 +113,8 @@ class Motion:
 
     @property
     def error(self) -> float:
-        """The distance [m] of the views, including the part that the overlap does not show; 0 if
-        noise explains the motion.
+        """The distance [m] of the views, including the part that the overlap does not show. It is 0
+        if noise explains the motion.
         """
         return math.hypot(self.distance, self.unsure) if self.chi_squared > VIEWS.likely else 0.0
 
@@ -195,8 +195,8 @@ def _judge(distance: float, limit: float) -> tuple[float, float, float]:
 
 
 def align_views(views: Sequence[PointCloud]) -> list[tuple[Float[Tensor, "4 4"], float]]:
-    """Return a motion new_from_old (4, 4) [m] of each view, after which the views agree best, and
-    its standard deviation [m] along the surface's normals.
+    """Return a motion new_from_old (4, 4) [m] of each view, after which the views agree best.
+    Return also its standard deviation [m] along the surface's normals.
 
     The views [m] have normals and are in one frame. The first stays; each other one is moved onto
     those that are placed. A motion that noise does not explain raises the warning `MendedInput`;
@@ -286,8 +286,8 @@ class _ViewSurface:
     ) -> tuple[Bool[Tensor, "n"], Float[Tensor, "n"], Points]:
         """Return (matched, heights [m], normals) of points by their nearest points of the surface.
 
-        Matched points face the same way, have a surface point under or over them, and are at most
-        `most` [m] high.
+        Matched points face the same way, and have a surface point under or over them. They are at
+        most `most` [m] high.
         """
         distance, row = map(torch.from_numpy, self._tree.query(points.numpy()))
         own = self.normals[row]
@@ -303,8 +303,8 @@ class _ViewSurface:
         return int(self.match(other.points[rows], other.normals[rows], MOTION.first)[0].sum())
 
     def height_before(self, other: "_ViewSurface") -> float:
-        """Return how high [m] another view stands before this surface, as its camera saw it; 0
-        without a camera, or if too few points can be compared.
+        """Return how high [m] another view stands before this surface, as its camera saw it. Return
+        0 without a camera, or if too few points can be compared.
         """
         if self._eye is None:
             return 0.0
@@ -331,8 +331,8 @@ class _ViewSurface:
 def _find_motion(fixed: _ViewSurface, view: _ViewSurface) -> Motion | None:
     """Return the most likely motion of a view onto a fixed one; None if they overlap too little.
 
-    It starts at the given pose, and minimises Tukey's loss of the heights of matching points over
-    the other surface, both ways, with the priors of `MOTION`.
+    It starts at the given pose, and minimises Tukey's loss with the priors of `MOTION`. The loss is
+    that of the heights of matching points over the other surface, both ways.
     """
     centre = view.points.mean(0)
     arms = view.points - centre

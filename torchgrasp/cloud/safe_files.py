@@ -78,10 +78,10 @@ def read_image_file(name: str, path: Path | str) -> Any:
     """Return the array in a file of a depth image, or of masks.
 
     Formats are .npy, .npz, .png and .tiff; also .exr for depth, and .json for masks. The argument
-    `name` "depth" has one channel, and is the array `depth` of a .npz file; other arrays raise the
+    `name` "depth" has one channel, and is the array `depth` of a .npz file. Other arrays raise the
     warning `NoEffect`. The argument "mask" may be a picture or several masks, in each form that
-    `torchgrasp.scene.masks.read_labels` takes.
-    Raises `BadArgument` for a file of another format, or a malformed one.
+    `torchgrasp.scene.masks.read_labels` takes. Raises `BadArgument` for a file of another format,
+    or a malformed one.
     """
     masks = name == "mask"
     data, suffix = read_suffixed(
@@ -148,8 +148,8 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
 def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tuple[bytes, str]:
     """Return the bytes and the lower-case suffix of a file.
 
-    Raises `BadArgument`, which calls the argument `name`, for a file that is missing, too large or
-    of none of the `suffixes`.
+    Raises `BadArgument`, which calls the argument `name`, for a file that is missing or too large.
+    Raises it also for a file with none of the `suffixes`.
     """
     path = Path(path)
     allowed = f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"

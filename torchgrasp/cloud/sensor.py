@@ -46,8 +46,8 @@ class FaultNumbers:
     fine: float = 0.5
     """Width [px] of patches of fine noise: neighbours are alike, and the next ones hardly."""
     spread: float = 0.2
-    """Share of the difference to each neighbour that a step of smoothing takes away: stable below a
-    quarter, and each step adds twice this share to the variance [px^2].
+    """Share of the difference to each neighbour that a step of smoothing takes away. It is stable
+    below a quarter. Each step adds twice this share to the variance [px^2].
     """
 
 
@@ -134,10 +134,10 @@ class SensorNoise(Value):
             twice as much, and it waves as wide as holes are.
         holes: share [0 to 1] of pixels that are lost in patches, as on dark and shiny parts.
         hole_width: width [px] of these patches.
-        crop: height [m] above the lowest point, along z of the frame of `partial_view`, below which
+        crop: height [m] above the lowest point, along z of the frame of `partial_view`. Below it,
             whoever cut the table away took the object, too. Depth images are not cropped.
-        misplaced: standard deviation [m] on each axis by which a calibration is off, which
-            moves the points of `partial_view` with their camera. Depth images do not move.
+        misplaced: standard deviation [m] on each axis by which a calibration is off. It moves the
+            points of `partial_view` with their camera. Depth images do not move.
 
     >>> float(SENSORS["kinect_v1"].sigma(torch.tensor(2.0))) < 0.007
     True
@@ -191,8 +191,9 @@ SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType(
         "realsense": SensorNoise(
             30.8, 0.08, 1 / 32, grain=5.0, bias=0.0015, bias_width=18.0, shadow=True
         ),
-        # The same as clouds of things come from other people: fitted to what the clouds of 7 things
-        # by a D435 and a D455 show by themselves (`scripts/bench.py shape --only residuals`).
+        # The same as clouds of things come from other people. It is fitted to what the clouds of 7
+        # things by a D435 and a D455 show by themselves
+        # (`scripts/bench.py shape --only residuals`).
         "realsense_cloud": SensorNoise(
             30.8,
             0.08,
@@ -217,7 +218,7 @@ SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType(
         "kinect_v1": SensorNoise(
             43.5, 0.05, 1 / 8, grain=2.0, bias=0.0014, bias_width=18.0, shadow=True
         ),
-        # Toelgyessy et al. 2021: below 17 mm and 11 mm of bias up to 3.5 m; flying pixels and
+        # Toelgyessy et al. 2021: below 17 mm and 11 mm of bias up to 3.5 m. Also flying pixels and
         # multipath of time of flight.
         "azure": SensorNoise(
             floor=0.001, growth=0.0005, bias=0.002, bias_width=30.0, flying=0.6, multipath=0.3
@@ -311,8 +312,8 @@ def add_noise(
 
 
 def _smooth(depth: Image, measured: Bool[Tensor, "h w"], width: float) -> Image:
-    """Return a depth image blurred by `width` [px] within each surface: not across a jump or the
-    border of what is measured.
+    """Return a depth image blurred by `width` [px] within each surface. It is not blurred across a
+    jump or the border of what is measured.
     """
     steps = max(1, round(width**2 / (2 * FAULTS.spread)))
     # a pixel and its neighbour below, or to the right, on one surface
@@ -399,8 +400,8 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
 
     Raises:
         BadArgument: no frame, or frames of several sizes or dtypes.
-        BadArgument: camera or scene have moved: a frame differs from the median in more than 5 % of
-            its pixels, or 1 % of its patches (`STILL`).
+        BadArgument: camera or scene have moved. Then a frame differs from the median in more than 5
+            % of its pixels, or 1 % of its patches (`STILL`).
 
     >>> frames = [[[0.0, 0.7]], [[0.0, 0.701]], [[0.5, 0.702]]]
     >>> median_depth([torch.tensor(frame) for frame in frames])
@@ -414,7 +415,7 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
     stack = torch.stack(images).double()  # (frames, h, w)
     stack = torch.where(torch.isfinite(stack) & (stack > 0), stack, torch.nan)
     middle = torch.nanquantile(stack, 0.5, dim=0)
-    # The median of two is their mean, from which each is half as far; the noise is less by a root.
+    # The median of two is their mean, from which each is half as far. The noise is less by a root.
     scale = math.sqrt(2) if len(stack) == 2 else 1.0
     rows, columns = (min(STILL.side, side) for side in middle.shape)
     for number, frame in enumerate(stack, start=1):
@@ -433,8 +434,8 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
 def _check_still(
     number: int, parts: str, off: Float[Tensor, "*b"], most: float, most_share: float
 ) -> None:
-    """Raise `BadArgument` if a frame differs from the others by more than `most`, as a share of the
-    depth, in more than a share of its parts; NaN is not measured.
+    """Raise `BadArgument` if a frame differs from the others by more than `most` in more than a
+    share of its parts. Differences are shares of the depth; NaN is not measured.
     """
     share = float((off > most).sum()) / max(1, int(torch.isfinite(off).sum()))
     if share > most_share:

@@ -43,8 +43,8 @@ class UnseenNumbers:
 class GuessNumbers:
     """Parameters of the search for the unknown camera position of a view.
 
-    The score of a camera position is how well it explains the bulge of the surface, which is
-    towards the camera, and the density of the points.
+    The score of a camera position is how well it explains two things. They are the bulge of the
+    surface, which is towards the camera, and the density of the points.
     """
 
     drawn: int = 2000
@@ -52,8 +52,8 @@ class GuessNumbers:
     half_view: float = 50.0
     """Points of a camera in the origin are at most this far from its axis [deg]."""
     ahead: float = 0.6
-    """Least cosine between z and the way to the middle of the points, of a camera in the origin that
-    looks along z; else z may be up.
+    """Least cosine between z and the way to the middle of the points. It is that of a camera in the
+    origin that looks along z; else z may be up.
     """
     far: float = 2.0
     """A cloud whose camera is in the origin is farther from it than this, in radii of the cloud."""
@@ -95,9 +95,9 @@ def guess_viewpoint(
 
     The camera is likely within this angle; 180 degrees means that the points hardly show the
     direction. `points` are (n, 3) [m]; `normals` (n, 3) are unit vectors of either sign. Of all
-    directions above the support, the one that explains the points best is taken; the camera is
+    directions above the support, the one that explains the points best is taken. The camera is
     placed along it, 4 radii of the cloud away. The direction `up` is above the support; the normal
-    of a support in the points replaces it. Before this search, the origin is tried: it is returned
+    of a support in the points replaces it. Before this search, the origin is tried. It is returned
     if the points lie in front of it along z and a camera there can have taken the view. With an
     `up` that is given and not only `assumed`, it is tried only for points below the origin.
     """
@@ -145,10 +145,10 @@ def _is_ahead(points: Points, centre: Vector, radius: Float[Tensor, ""]) -> bool
 def can_see(points: Points, normals: Points, viewpoint: Vector) -> bool:
     """Return whether a camera at `viewpoint` (3,) [m] can have taken a view.
 
-    From there, points must not hide other points. In addition, one of three conditions must hold:
-    the points are as dense as the camera's pixels; no other place explains the points much better;
-    the camera looks down on a support. `points` are (n, 3) [m]; `normals` (n, 3) are unit vectors
-    of either sign.
+    From there, points must not hide other points. In addition, one of three conditions must hold.
+    First, the points are as dense as the camera's pixels. Second, no other place explains the
+    points much better. Third, the camera looks down on a support. `points` are (n, 3) [m];
+    `normals` (n, 3) are unit vectors of either sign.
     """
     points, normals = _draw(points, normals)
     if max(UNSEEN.excess(share_unseen(points, normals, viewpoint))) > 1:
@@ -180,8 +180,8 @@ def _enclose(points: Points) -> tuple[Vector, Float[Tensor, ""]]:
 def _explain(
     points: Points, normals: Points, viewpoints: Float[Tensor, "k 3"]
 ) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
-    """Return two scores of each camera position, at most 1, for how well it explains a view's bulge
-    and point density.
+    """Return two scores of each camera position, at most 1. They say how well it explains a view's
+    bulge and point density.
 
     Visible surfaces bulge towards the camera. A pixel covers an area that grows with the squared
     distance, over the cosine between ray and normal.

@@ -2,8 +2,8 @@
 
 Forces that balance lie in the null space of the grasp map. For three contacts the null space has
 three dimensions: opposite pushes along each side of the triangle. A search over directions in this
-space finds the best forces. For four and five contacts the forces are F = N z, with a basis N of
-the null space, normal parts a_i and tangential parts t_i. Friction cones with friction coefficient
+space finds the best forces. For four and five contacts the forces are F = N z. N is a basis of the
+null space, with normal parts a_i and tangential parts t_i. Friction cones with friction coefficient
 tau have an analytic centre, the forces that minimise
 
     sum c_i a_i - sum log(tau^2 a_i^2 - |t_i|^2).
@@ -254,8 +254,8 @@ def _improve(
     rounds: Iterable[Float[Tensor, "p _"]],
     preferred: Float[Tensor, "b f"] | None,
 ) -> tuple[Tensions, Bool[Tensor, "b"]]:
-    """Return the weights of least cost, of length 1, after rounds of a search, and a mask of the
-    sets where they push everywhere.
+    """Return the weights of least cost, of length 1, after rounds of a search. Return also a mask
+    of the sets where they push everywhere.
 
     `push` and `slide` map weights to normal and tangential forces (n = 3 f numbers). Each of the
     `rounds` (p, s) holds the s changes of the weights that it tries; s may differ.
@@ -321,7 +321,7 @@ def central_forces(
 
     `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals. `preferred`
     are normal forces, which also fix the scale of the result. `slack` is added to the friction
-    coefficient that the forces need: a larger one gives forces nearer to the preferred ones. The
+    coefficient that the forces need. A larger one gives forces nearer to the preferred ones. The
     forces of a set are NaN where no balanced forces push at every contact within the widest cones.
     """
     wrench = grasp_map(points / centre_and_radius(points)[1])

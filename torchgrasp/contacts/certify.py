@@ -56,16 +56,16 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     a proof in float64.
 
     The answer is `Certificate.closed`. The wrenches w of a set are forces along the edges of its
-    friction cones, with their torques; they are the columns of W. Coefficients phi with W phi = 0
+    friction cones, with their torques. They are the columns of W. Coefficients phi with W phi = 0
     and sum phi = 1 balance them. The margin is the largest s with phi >= s for such a phi, or -inf
     without one. A set is `closed` if its margin is at least 1e-6 (`MIN_MARGIN`) and its
     `rank_ratio` at least 1e-3 (`MIN_RANK_RATIO`). Then its contacts must not lie almost on a line,
     and phi must balance W up to rounding.
 
-    If a set is not closed, its `witness` is a unit wrench v that no contact force opposes: v . w >=
-    0 for every edge wrench w, up to rounding. If only the rank is too low, the wrenches are
-    smallest along v. A set with a contact that is not finite is not closed. Its margin and witness
-    are NaN.
+    If a set is not closed, its `witness` is a unit wrench v that no contact force opposes. That is
+    v . w >= 0 for every edge wrench w, up to rounding. If only the rank is too low, the wrenches
+    are smallest along v. A set with a contact that is not finite is not closed. Its margin and
+    witness are NaN.
 
     The margin has a first derivative by points and normals:
 
@@ -102,8 +102,8 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 class _Proof(torch.autograd.Function):
     """The proof of force closure as a differentiable function of m wrenches.
 
-    Its results are the first five fields of a `Certificate`, the coefficients phi (b, m), and the
-    multipliers (b, 6) of W phi = 0.
+    Its results are the first five fields of a `Certificate`, and the coefficients phi (b, m). Last
+    are the multipliers (b, 6) of W phi = 0.
     """
 
     @staticmethod
@@ -233,10 +233,10 @@ def bound_margin(wrench: Wrenches, witness: Float[Tensor, "b 6"]) -> Float[Tenso
     """Return the upper bound of the closure margin that each direction `witness` in wrench space
     proves.
 
-    It is -min(g) / sum(g - min(g)) for the products g of the witness and the m edge wrenches of a
-    contact set, `wrench` (b, m, 6); NaN if all products are 0. The bound has no unit.
+    It is -min(g) / sum(g - min(g)), or NaN if all products g are 0. These are the products of the
+    witness and the m edge wrenches of a contact set, `wrench` (b, m, 6). The bound has no unit.
     """
-    # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g /
+    # With g_k = w.w_k and phi >= s, 0 = sum phi g >= s sum g + (1 - m s) min g. Hence s <= -min g /
     # sum(g - min g).
     product = matvec(wrench, witness)
     least = product.amin(-1)

@@ -1,7 +1,7 @@
 """The probability that a grasp has force closure on the true surface, given the uncertain shape.
 
 Each fingertip approaches along the normal of its contact. Random surfaces are drawn from the
-Gaussian process along these lines, and give the points and normals at which the fingertips touch.
+Gaussian process along these lines. They give the points and normals at which the fingertips touch.
 """
 
 import dataclasses
@@ -51,8 +51,8 @@ class LinePosterior(Batch):
     The line of a contact x with the normal n holds the points x + t n. Lengths are in normalised
     units; w and `slope` have no unit. `deviation` is the standard deviation of the surface at each
     contact, which is the unit of the positions `grid`. `distance` is the mean of d at these 23
-    positions, `slope` the mean of w at five of them, the nodes. `root` is the symmetric root of the
-    covariance of d and w at all nodes (`node_covariance`).
+    positions. `slope` is the mean of w at five of them, the nodes. `root` is the symmetric root of
+    the covariance of d and w at all nodes (`node_covariance`).
     """
 
     points: Vectors  # planned contacts x (b, f, 3)
@@ -183,7 +183,7 @@ def node_covariance(
     """Return the posterior covariance of signed distance d and gradient w at all nodes of the
     lines.
 
-    The z = 20 f values of a contact set are ordered by line, then by node, and are d and w along
+    The z = 20 f values of a contact set are ordered by line, then by node. They are d and w along
     the normal and two tangents. `points` and `normals` (b, f, 3) are normalised contacts and
     outward unit normals. `nodes` are normalised positions on the lines; those outside the domain
     are moved to its edge. The gradient is a difference quotient over a fingertip's width.
@@ -220,8 +220,8 @@ def first_contact(
     surfaces.
 
     Both have the shape (b, n, f, 3), and are NaN where a line meets no surface. `drawn` holds the
-    deviations of the random surfaces from the mean, z = 20 f values (d, w) at the nodes of the
-    lines.
+    deviations of the random surfaces from the mean. They are z = 20 f values (d, w) at the nodes of
+    the lines.
     """
     deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
     t = grid().to(drawn)
@@ -294,8 +294,8 @@ def closure_probability(
         n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)).
         seed: random seed.
 
-    Raises `BadArgument` for a contact that is not finite, a contact outside the shape's domain or
-    at its edge, or another wrong argument.
+    Raises `BadArgument` for a contact that is not finite, or outside the shape's domain or at its
+    edge. Raises it also for another wrong argument.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

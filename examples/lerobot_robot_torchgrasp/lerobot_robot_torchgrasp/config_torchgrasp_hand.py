@@ -14,8 +14,8 @@ class TorchgraspHandConfig(RobotConfig):
         plan: file of grasps, as `torchgrasp grasp` writes it; the hand starts at its approach.
         row: number of the grasp in the file; 0 is the best.
         hand: name of a shipped hand, or the folder of your own.
-        body: "dry" is at its targets at once; "mujoco" simulates hand, object and table; or a class
-            of your own as "module:Class", which has the methods of `bodies.Body`.
+        body: "dry" is at its targets at once. "mujoco" simulates hand, object and table. Or it is a
+            class of your own as "module:Class", which has the methods of `bodies.Body`.
         object: shipped object, or file of its closed mesh [m] in the frame of the grasps; "mujoco"
             needs it.
         fps: targets a second; as of the data set.

@@ -52,8 +52,8 @@ class GraspSkill:
         grasps: the grasp, as a batch of one.
         ends: time [s] at which each phase ends, by its name.
 
-    Raises `BadArgument` for a grasp of another hand or another row, one that failed a check, and a
-    rate that is not positive.
+    Raises `BadArgument` for a grasp of another hand or another row, and for one that failed a
+    check. Raises it also for a rate that is not positive.
     """
 
     def __init__(

@@ -15,8 +15,8 @@ from torchgrasp.foundation.errors import BadArgument
 class TorchgraspHand(Robot):
     """A hand whose actions are targets of all its joints [rad] and the pose of its root.
 
-    The names are those of the joints in the URDF, then `hand.x` to `hand.qw`: the pose in the frame
-    of the grasps [m], as in the data sets of `write_lerobot`.
+    The names are those of the joints in the URDF, then `hand.x` to `hand.qw`. The latter are the
+    pose in the frame of the grasps [m], as in the data sets of `write_lerobot`.
     """
 
     config_class = TorchgraspHandConfig
@@ -70,7 +70,7 @@ class TorchgraspHand(Robot):
         """Send a target, and return it.
 
         Raises `BadArgument` for other names than those of this hand, and for numbers that are not
-        finite; then nothing is sent.
+        finite. Then nothing is sent.
         """
         body = self._connected()
         other = sorted(set(action) ^ set(self.skill.names))

@@ -1,7 +1,7 @@
-"""Lifts of low bodies near a corner of their table: the hand may drag them to one of its two edges.
+"""Lifts of low bodies near a corner of their table. The hand may drag them to one of its two edges.
 
-Of the grasps where a body lies, and of those at either edge, those with the highest predicted
-success are used. The corner is turned at random against body and camera.
+A body has grasps where it lies, and grasps at either edge. Those with the highest predicted success
+are used. The corner is turned at random against body and camera.
 """
 
 import dataclasses
@@ -48,8 +48,8 @@ LIMIT = 600.0
 
 
 class Outcome(NamedTuple):
-    """What came of one body: where it was grasped ("edge" or "table"), the number of tries that
-    raised it (0 for none), the same where it lies, and why it was lost.
+    """What came of one body: where it was grasped ("edge" or "table"), and the number of tries that
+    raised it (0 for none). The same follows for grasps where it lies, and why it was lost.
     """
 
     where: str

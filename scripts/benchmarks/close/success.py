@@ -1,8 +1,9 @@
 """Whether predicted success is true, whether the best grasp is the best, and whether a promise is
 kept.
 
-Objects that the model of success was not fitted on are planned on at three frictions, each with a
-mass of its own. The 20 best grasps and some that follow are pulled at by protocol "dexgraspbench".
+Objects are planned on that the model of success was not fitted on. Each is planned at three
+frictions, each with a mass of its own. The 20 best grasps and some that follow are pulled at by
+protocol "dexgraspbench".
 """
 
 import itertools
@@ -169,8 +170,8 @@ def judge_trials(trials: Iterable[tuple[str, int, float, bool]]) -> dict[str, An
 
 
 def judge_order(cells: list[Cell]) -> list[Row]:
-    """Return how much more often the best grasp passes than the mean of the 20 best, and how often
-    by group.
+    """Return how much more often the best grasp passes than the mean of the 20 best. Return also
+    how often by group.
     """
     gains = [
         (c.family, 100 * (c.best[0][2] - sum(x[2] for x in c.best) / len(c.best))) for c in cells

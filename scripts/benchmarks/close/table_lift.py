@@ -1,5 +1,5 @@
-"""Lifts of a quarter of a kilogram off a slippery table, in place, moved after the view, and pushed
-in the air.
+"""Lifts of a quarter of a kilogram off a slippery table. The object is in place, moved after the
+view, or pushed in the air.
 
 The best grasp of one view of each object is lifted under protocol "table-lift". An object without a
 grasp fails.
@@ -61,8 +61,8 @@ def table_lift(o: Options) -> list[Row]:
 
 
 def lift_objects(o: Options, hand: Hand, protocol: Protocol, simulator: str) -> list[ViewScore]:
-    """Return the scores of the best grasp of each object under a protocol, with saved grasps, or
-    with new ones that are then kept.
+    """Return the scores of the best grasp of each object under a protocol. The grasps are saved
+    ones, or new ones that are then kept.
     """
     noise = dataclasses.replace(protocol.noise, draws=o.draws)
     protocol = dataclasses.replace(protocol, noise=noise).with_trial(simulator=simulator)

@@ -1,6 +1,4 @@
-"""Plans of many clouds at once beside plans of each alone: the same grasps, and how many of them a
-second.
-"""
+"""Plans of many clouds at once beside plans of each alone: the same grasps, and how many a second."""
 
 import time
 from collections.abc import Callable
@@ -28,7 +26,7 @@ POINTS = 1000
 
 @bench("gpu/clouds")
 def plan_clouds(o: Options) -> list[Row]:
-    """Plan batches of clouds at once, on a GPU if there is one; the smallest batch also on the
+    """Plan batches of clouds at once, on a GPU if there is one. Plan the smallest batch also on the
     cores of the CPU.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

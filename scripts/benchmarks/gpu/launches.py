@@ -1,5 +1,5 @@
-"""What a plan asks of a GPU, counted without one: kernel launches, waits of the host and uploads,
-by stage and line.
+"""What a plan asks of a GPU, counted without one. Counted are kernel launches, waits of the host
+and uploads, by stage and line.
 
 The planner runs on the pretended device of `tests/devices`, which computes on the CPU.
 """

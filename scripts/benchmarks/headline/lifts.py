@@ -1,5 +1,5 @@
-"""Lifts of the left-out objects: four hands in place, and the Allegro hand in other conditions and
-in a second simulator; and lifts of low bodies.
+"""Lifts of the left-out objects: four hands in place, the Allegro hand in other conditions and in a
+second simulator. Also lifts of low bodies.
 """
 
 import dataclasses

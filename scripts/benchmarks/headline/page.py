@@ -88,8 +88,8 @@ def replace_table(text: str, lines: Sequence[str]) -> str:
 def golden_plans() -> dict[str, Any]:
     """Return what identifies a plan of each golden pair of object and hand.
 
-    These are the number of candidates of each status; and of the best grasp its joints [rad], its
-    contacts [m] and its log-odds.
+    These are the number of candidates of each status. Of the best grasp they are its joints [rad],
+    its contacts [m] and its log-odds.
     """
     return {f"{name}/{hand}": _plan(name, hand) for name, hand in GOLDEN}
 

@@ -1,5 +1,5 @@
-"""What it costs to be told where to hold: the best grasp of a free plan beside the best with all
-contacts in a region.
+"""What it costs to be told where to hold. The best grasp of a free plan stands beside the best one
+with all contacts in a region.
 
 The region is chosen from the cloud before planning. It is the upper half of the cloud's bounding
 box for every second object, and for the others the half of its longer horizontal side with fewer

@@ -1,5 +1,5 @@
 """The hidden side of the left-out objects, rendered, and of real things that two cameras saw at
-once; and how long plans take.
+once. Also how long plans take.
 """
 
 import dataclasses
@@ -60,7 +60,7 @@ def rendered(o: Options) -> list[Row]:
 
 @bench("headline/real")
 def real(o: Options) -> list[Row]:
-    """Compare the estimated surface of one camera with what the other measured, and tell where the
+    """Compare the estimated surface of one camera with what the other measured. Tell where the
     contacts of the best grasp lie.
     """
     if o.clouds is None:
@@ -107,8 +107,8 @@ def measure_view(folder: Path, name: str) -> dict[str, float]:
 
 
 def measure_shape(shape: ShapeGP, mesh: trimesh.Trimesh, cloud: PointCloud) -> dict[str, float]:
-    """Return errors of a shape [m] on the true surface that a cloud does not show, without the face
-    on the table.
+    """Return errors of a shape [m] on the true surface that a cloud does not show. The face on the
+    table is left out.
 
     * "median", "p90": distance [mm] of the true surface from the estimated one.
     * "within_1", "within_2", "within_3": share of the true surface within k std_m. Surface outside

@@ -1,5 +1,5 @@
-"""Where the contacts of grasps lie that were planned on one real view: on measured surface, or on
-guessed surface that says so.
+"""Where the contacts of grasps lie that were planned on one real view. They lie on measured
+surface, or on guessed surface that says so.
 """
 
 import dataclasses
@@ -30,8 +30,8 @@ FRICTION = 0.8
 
 @dataclasses.dataclass(frozen=True)
 class Touch:
-    """The contacts of one grasp: their distances `away` from what any camera measured, and the
-    deviation `std_m` of the surface there [m]; and the grasp's predicted success.
+    """The contacts of one grasp, and its predicted success. `away` are their distances from what
+    any camera measured, and `std_m` the deviation of the surface there [m].
     """
 
     away: Tensor

@@ -27,8 +27,8 @@ Numbers = dict[str, float]
 
 
 class Measure(NamedTuple):
-    """A number of the jobs: its name, its text, the statistic of all jobs, the unit, and the most
-    ratio to the other commit; of a rate, the least.
+    """A number of the jobs: its name, its text, the statistic of all jobs, and the unit. Last is
+    the most ratio to the other commit; of a rate, the least.
     """
 
     name: str

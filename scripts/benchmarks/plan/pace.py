@@ -1,4 +1,6 @@
-"""How long a person waits for grasps on one core: for the first, for fifty, and for all of a view."""
+"""How long a person waits for grasps on one core. It is timed for the first, for fifty, and for all
+of a view.
+"""
 
 from tqdm import tqdm
 
@@ -9,8 +11,8 @@ from benchmarks.plan.timed import time_stream
 from torchgrasp import load_hand, load_object
 
 BARS = (0.4, 1.0, 1.2, 2.2, 110.0)
-"""Bars of the Allegro hand for the first of `MEASURES`: most CPU seconds from a cloud to grasps, and
-least executable grasps for each CPU second.
+"""Bars of the Allegro hand for the first of `MEASURES`. They are the most CPU seconds from a cloud
+to grasps, and the least executable grasps for each CPU second.
 """
 
 

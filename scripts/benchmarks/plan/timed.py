@@ -63,8 +63,8 @@ def read_view(view: str) -> PointCloud:
 def time_stream(
     cloud: PointCloud, hand: Hand, friction: float, starts: int, seed: int
 ) -> dict[str, float]:
-    """Return the CPU seconds from a cloud to the first grasp, to fifty and to all, NaN if there are
-    none, and the number of grasps.
+    """Return CPU seconds from a cloud to the first grasp, to fifty and to all, and the number of
+    grasps. The seconds are NaN if there are none.
     """
     spec = ContactSpec(friction=friction, table=0.0)
     found = {"first": math.nan, "fifty": math.nan}
@@ -118,8 +118,8 @@ def calls(hand: str, starts: int, seed: int) -> dict[str, float]:
 
 
 def cold(hand: str, starts: int, seed: int) -> dict[str, float]:
-    """Return the CPU seconds of a new process that imports the library, and of one that plans on
-    the shipped jug without a report.
+    """Return the CPU seconds of a new process that imports the library. Return also those of one
+    that plans on the shipped jug without a report.
     """
     with tempfile.TemporaryDirectory() as out:
         words = ["grasp", "jug", "--hand", hand, "--no-report", "--out", out]

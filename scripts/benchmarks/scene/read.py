@@ -69,8 +69,8 @@ def understand(room: Room) -> Understood:
 def plane_error(
     plane: Plane, normal: Tensor, at: Tensor, height: float = 0.0
 ) -> tuple[float, float]:
-    """Return the angle [deg] of a plane to the true normal (3,), and the error [mm] of the `height`
-    [m] of a point (3,) above it.
+    """Return the angle [deg] of a plane to the true normal (3,). Return also the error [mm] of the
+    `height` [m] of a point (3,) above it.
     """
     cosine = float(plane.normal.double() @ normal.double())
     found = float(plane.height(at.double()))

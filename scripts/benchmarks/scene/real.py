@@ -1,4 +1,4 @@
-"""Real frames: the support against the true one, also in varied images, and the number of objects
+"""Real frames: the support against the true one, also in varied images. Also the number of objects
 against the true number.
 
 The folder of frames holds frames.json and, for each frame, NAME_depth.png and perhaps
@@ -108,8 +108,8 @@ def is_right(name: str, error: tuple[float, float]) -> bool:
 def support_errors(
     supports: Sequence[Plane], frame: dict[str, Any], normal: Sequence[float] = ()
 ) -> list[tuple[float, float]]:
-    """Return the angle [deg] of each support to the `normal`, by default that of the frame, and the
-    error [mm] of the camera's height above it.
+    """Return the angle [deg] of each support to the `normal`, by default that of the frame. Return
+    also the error [mm] of the camera's height above it.
     """
     true = torch.tensor(normal or frame["table_normal"], dtype=torch.float64)
     camera = torch.zeros(3, dtype=torch.float64)
@@ -138,7 +138,8 @@ def vary(
     folder: Path, name: str, frame: dict[str, Any], draw: np.random.Generator
 ) -> tuple[np.ndarray, list[float], list[float]]:
     """Return a frame's depth image, turned about the camera's axis, cut, perhaps mirrored and with
-    noise; its intrinsics, with the size of the image; and the true normal in its camera's frame.
+    noise. Return also its intrinsics, with the size of the image, and the true normal in its
+    camera's frame.
     """
     depth = read(folder, name, "depth")
     fx, fy, cx, cy = frame["intrinsics"]

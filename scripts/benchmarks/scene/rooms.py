@@ -113,8 +113,8 @@ def rooms(seed: int, kind: str | None = None, sensor: SensorName | None = None) 
 
 
 class Furniture(NamedTuple):
-    """Named parts, the radius [m] of the circle that things stand in, and the limits of the view
-    (azimuths, elevations [deg], distances [m]).
+    """Named parts, the radius [m] of the circle that things stand in, and the limits of the view.
+    The limits are azimuths, elevations [deg] and distances [m].
 
     `tilt` turns the support about the origin, as a rotation vector.
     """
@@ -207,8 +207,8 @@ def _above(rng: np.random.Generator) -> Furniture:
 
 MAKERS = (_round, _rectangular, _holes, _wall, _bin, _shelf, _board, _ground, _above)
 KINDS = {make.__name__.removeprefix("_"): make for make in MAKERS}
-"""Kinds of rooms: a round or rectangular table over a floor, a plate with holes, a table at a wall,
-a bin, a shelf, a tilted board, the ground itself, and a table from above.
+"""Kinds of rooms: a round or rectangular table over a floor, a plate with holes, a table at a wall.
+Also a bin, a shelf, a tilted board, the ground itself, and a table from above.
 """
 
 

@@ -1,4 +1,4 @@
-"""A given target among neighbours: the things stand close, touch and hide each other, and one of
+"""A given target among neighbours. The things stand close, touch and hide each other, and one of
 them is to be lifted.
 
 The target is given by its true mask, or by a click in its middle. The library finds the table and
@@ -89,7 +89,7 @@ class Clutter:
 class TargetTry:
     """What became of one target that was given in one way.
 
-    `purity` is the share of the pixels taken for the target that are its own, and `share` the share
+    `purity` is the share of the pixels taken for the target that are its own. `share` is the share
     of its own measured pixels that are taken. Without a grasp, `said` is the reason, and `clear`
     counts the neighbours to take away first. `doubted` tells whether advice names the target. The
     prediction is NaN if the success is unknown. A refused target has pixels and prediction 0.
@@ -203,8 +203,8 @@ def draw_body(draw: np.random.Generator, k: int | None = None) -> HouseholdBody:
 def push_together(
     meshes: Sequence[trimesh.Trimesh], draw: np.random.Generator
 ) -> list[Float[Tensor, "4 4"]]:
-    """Return upright poses: the first mesh above the origin, each other one moved towards it from
-    outside until its gap is reached.
+    """Return upright poses, the first mesh above the origin. Each other one is moved towards it
+    from outside until its gap is reached.
     """
     placed = list[Float[Tensor, "k 2"]]()
     poses = list[Float[Tensor, "4 4"]]()

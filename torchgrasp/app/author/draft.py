@@ -1,8 +1,8 @@
 """A first hand.toml for a URDF, and a clean copy of the URDF: fingers, pads, coupling, pairs of
 links.
 
-A published URDF is repaired (`repair`), its meshes are replaced by simple shapes (`fit_shapes`),
-and the fingertip pads are guessed (`pads`). Every guess is marked in the text.
+A published URDF is repaired (`repair`), and its meshes are replaced by simple shapes
+(`fit_shapes`). Then the fingertip pads are guessed (`pads`). Every guess is marked in the text.
 """
 
 import dataclasses
@@ -66,8 +66,8 @@ class DraftNumbers:
     most_stiffness: float = 10.0  # greatest stiffness of a drive [N m/rad]
     damping: float = 0.03  # least time constant [s]: the ratio of damping to stiffness
     trials: int = 1000  # random postures of each set of fingers in which a free one is sought
-    # Where fewer than this share of them are free, pairs of links that meet in at least these
-    # shares are left out: their shapes are too coarse. Real fingers do not meet themselves so often.
+    # If fewer than this share of them are free, pairs of links that meet in these shares or more
+    # are left out. Their shapes are too coarse. Real fingers do not meet themselves so often.
     least_free: float = 0.02
     most_within: float = 0.25  # pairs of one finger
     most_between: float = 0.5  # other pairs
@@ -174,8 +174,8 @@ def new_hand(
 ) -> Draft:
     """Return a hand.toml for a published URDF or MJCF, with a repaired copy of the URDF.
 
-    If hardly any random posture is free of self-collision, the pairs of links that meet most often
-    are no longer tested. A warning names them.
+    Sometimes hardly any random posture is free of self-collision. Then the pairs of links that meet
+    most often are no longer tested. A warning names them.
 
     Args:
         path: the URDF; or an MJCF (.xml, .mjcf), which MuJoCo reads and which becomes a URDF.
@@ -187,7 +187,8 @@ def new_hand(
         HandFileError: a file or a mesh that is missing, malformed, too large or outside its folder.
         HandFileError: no collision shape, or a fault that cannot be repaired.
         BadArgument: an unknown root; fewer than three tips or more than five; a tip without a
-            collision shape or a movable joint; or a bad length or radius of a sensor.
+            collision shape. Also a tip without a movable joint, or a bad length or radius of a
+            sensor.
         MissingExtra: an MJCF without MuJoCo.
 
     >>> from torchgrasp import load_hand
@@ -312,8 +313,8 @@ def _tips(reduced: _Reduced, wish: Wish, origin: FromMjcf | None) -> tuple[str, 
 def _round_tips(
     urdf: Urdf, clean: Urdf, tips: Sequence[str], guess: Guess, surfaces: dict[str, np.ndarray]
 ) -> tuple[Urdf, list[str]]:
-    """Return the `clean` URDF with a ball in each tip of no simple shape in `urdf`, and a sentence
-    on them, if any.
+    """Return the `clean` URDF with a ball in each tip of no simple shape in `urdf`. Return also a
+    sentence on these tips, if any.
     """
     simple = {x.name for x in urdf.links if is_primitive(x)}
     balls = list[str]()
@@ -356,8 +357,8 @@ def _thin_tips(tips: tuple[str, ...], surfaces: dict[str, np.ndarray]) -> list[s
 def _part_pairs(
     urdf: Urdf, options: Mapping[str, "FingerSet"], seed: int
 ) -> tuple[dict[tuple[str, str], float], list[str]]:
-    """Return the pairs of links to test for collision, each with 0, or with the share of random
-    postures in which it meets if it is left out; then warnings.
+    """Return pairs of links, then warnings. A pair to test for collision has 0. A pair that is left
+    out has the share of random postures in which it meets.
 
     Pairs are left out where some option has hardly a free posture with them.
     """

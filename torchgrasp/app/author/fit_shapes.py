@@ -37,8 +37,8 @@ class FitNumbers:
     sections: int = 48  # sides of a sampled cylinder
     # least value of a mesh's largest coordinate [m]; below it the mesh is in a wrong unit
     least_reach: float = 5e-4
-    # A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of
-    # all boxes; smaller gives more boxes.
+    # A box of a link or of a fingertip is cut in two if this saves enough volume. The number is a
+    # share of the volume of all boxes; smaller gives more boxes.
     saving: float = 0.12  # share for a box of a link
     saving_tip: float = 0.04  # share for a box of a fingertip
     short_boxes: int = 3  # most boxes of a short body
@@ -79,8 +79,8 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
         )
     if path.suffix.lower() not in MESH_KINDS:
         raise urdf.wrong(f"{called} of another format", f"a mesh ({', '.join(MESH_KINDS)})")
-    # The files of a package may lie anywhere in the folder: the first parts of the path may be left
-    # out, and folders above the URDF count.
+    # The files of a package may lie anywhere in the folder. So the first parts of the path may be
+    # left out, and folders above the URDF count.
     package = name.startswith("package://")
     above = [x for x in here.parents if package and x.is_relative_to(base)]
     roots = (here, *above, base)
@@ -173,8 +173,8 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
 def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
     """Return the URDF with a ball at the end of the link `tip` instead of its shapes.
 
-    A long tip also gets boxes up to the ball. `ball` is the pad, the unit vector `outward` points
-    to the end of the finger, and `points` (n, 3) [m] lie on the tip, all in its frame.
+    A long tip also gets boxes up to the ball. `ball` is the pad, and the unit vector `outward`
+    points to the end of the finger. `points` (n, 3) [m] lie on the tip. All are in its frame.
     """
     link = next(x for x in urdf.links if x.name == tip)
     reach = (points - np.array(ball.center)) @ outward

@@ -20,7 +20,7 @@ TIP = "tip"  # in the name of a site at a fingertip
 
 @dataclasses.dataclass(frozen=True)
 class Drive:
-    """Limits [rad or m] and effort [N m or N] of a joint; the effort is 0 if the file has none."""
+    """Limits [rad or m] and effort [N m or N] of a joint. The effort is 0 if the file has none."""
 
     lower: float
     upper: float
@@ -66,8 +66,8 @@ class ModelHand:
         return HandFileError("mjcf", f"{self.path}: {found}", allowed)
 
     def choose(self, root: str) -> None:
-        """Choose the bodies of the hand: all below its first body, or those below several bodies
-        of the world that move.
+        """Choose the bodies of the hand. They are all below its first body, or those below several
+        bodies of the world that move.
         """
         tops = self._tops()
         every = range(1, self.model.nbody)
@@ -289,8 +289,8 @@ class ModelHand:
         return np.array(rows).reshape(-1, model.njnt), np.array(values)
 
     def _tied(self, kind: int, index: int) -> tuple[np.ndarray, float]:
-        """Return what an equality ties, a joint or a tendon, as a sum over joints, and its value in
-        the reference posture.
+        """Return what an equality ties, a joint or a tendon, as a sum over joints. Return also its
+        value in the reference posture.
         """
         model = self.model
         if kind == int(self.mujoco.mjtEq.mjEQ_TENDON):
@@ -426,8 +426,8 @@ class ModelHand:
         return drives
 
     def _leading_arms(self, tendon: int, mechanism: Mechanism) -> tuple[dict[str, float], float]:
-        """Return the arm of a fixed tendon on each leading joint by name, and the part of its
-        length that no joint changes.
+        """Return the arm of a fixed tendon on each leading joint by name. Return also the part of
+        its length that no joint changes.
         """
         arms = dict[str, float]()
         shift = 0.0
@@ -447,8 +447,8 @@ class ModelHand:
         return arms, shift
 
     def tip_links(self) -> tuple[str, ...]:
-        """Return the links with a site whose name says that it is at a fingertip; () if they are
-        not three to five.
+        """Return the links with a site whose name says that it is at a fingertip. Return () if they
+        are not three to five.
         """
         model = self.model
         touching = {

@@ -55,11 +55,11 @@ refuse = functools.partial(HandFileError, "mjcf")  # the error of this gate, as 
 
 
 class SafeMjcf(NamedTuple):
-    """The name and the checked text of an MJCF, its meshes by the names in the text, and what is
-    left out.
+    """The name and the checked text of an MJCF. Also its meshes by the names in the text, and what
+    is left out.
 
-    `left_out` holds the tags of elements that say something about a hand's motion or touch, which
-    this library does not use.
+    `left_out` holds the tags of elements on a hand's motion or touch that this library does not
+    use.
     """
 
     name: str
@@ -90,8 +90,8 @@ def read_mjcf_text(path: Path, base: Path | None = None) -> SafeMjcf:
 
     By default this is the folder of the file.
 
-    Raises `HandFileError` for files that are missing, outside, malformed or too large, and for
-    elements that make many bodies or read other models.
+    Raises `HandFileError` for files that are missing, outside, malformed or too large. Raises it
+    also for elements that make many bodies or read other models.
     """
     left = Counter[str]()
     spot = _Spot(path, (base or path.parent).resolve())

@@ -1,8 +1,8 @@
 """Guesses of fingertip pads: their contact points and normals.
 
 A URDF does not define pads. The guessed pad faces the direction in which the finger's last joint
-bends: the side with most of the joint's range or, for a symmetric range, towards the other
-fingertips.
+bends. This is the side with most of the joint's range. For a symmetric range it is the side towards
+the other fingertips.
 """
 
 import dataclasses
@@ -30,8 +30,8 @@ class PadNumbers:
 
     # share of the random postures, those with the nearest tips, in which fingers meet
     near_share: float = 0.1
-    # A joint bends to one side if the middle of its range lies farther than this share of it from
-    # zero.
+    # A joint bends to one side if the middle of its range is farther than this from zero. The
+    # number is a share of the range.
     one_sided: float = 0.1
     # angle [rad] by which the contact of a round tip is turned from its motion to the finger's end
     tilt: float = math.radians(30)
@@ -82,9 +82,9 @@ def guess_pads(
 ) -> Guess:
     """Return guessed pads of the fingertips, and the direction out of the palm.
 
-    `frames` (3, 4, l, n) are poses [m] of the l links `tips` and, last, of the palm, in n random
-    postures, in the frame of the URDF's root. `surfaces` holds points (k, 3) [m] on each link, by
-    its name, in its frame.
+    `frames` (3, 4, l, n) are poses [m] in n random postures, in the frame of the URDF's root. They
+    are of the l links `tips` and, last, of the palm. `surfaces` holds points (k, 3) [m] on each
+    link, by its name, in its frame.
     """
     links = {x.name: i for i, x in enumerate(urdf.links)}
     cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
@@ -132,9 +132,9 @@ def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
 def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
     """Return the indices of the f tips in grasp order.
 
-    First come three whose pads face each other in the largest share of postures; each further one
+    First come three whose pads face each other in the largest share of postures. Each further one
     keeps the share largest. `frames` are poses (3 x 4) [m] of the tips in n random postures, in the
-    frame of the URDF's root; `pads` are in the frames of the tips.
+    frame of the URDF's root. `pads` are in the frames of the tips.
     """
     contacts = torch.tensor([pad.contact for pad in pads], dtype=torch.float64)
     normals = torch.tensor([pad.normal for pad in pads], dtype=torch.float64)
@@ -190,8 +190,8 @@ def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
 
 
 def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
-    """Return the last joint that moves a tip, and in the tip's frame its motion and the direction
-    from joint to tip.
+    """Return the last joint that moves a tip. Return also, in the tip's frame, its motion and the
+    direction from joint to tip.
     """
     tip_from_above = np.eye(4)
     for joint in urdf.joints_above(tip):
@@ -209,8 +209,8 @@ def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
 
 
 def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
-    """Return a point near the far end of a tip, in its frame: half its thickness before the end of
-    a simple shape.
+    """Return a point near the far end of a tip, in its frame. It lies half the tip's thickness
+    before the end of a simple shape.
     """
     if not is_primitive(link):
         points = surfaces[link.name]
@@ -227,8 +227,8 @@ def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
 
 
 def _pad(shape: LinkShape, core: Vector, motion: Vector, outward: Vector) -> Pad:
-    """Return the pad of a tip that is one simple shape, on the side of its motion; on a sphere
-    nearer to its end.
+    """Return the pad of a tip that is one simple shape, on the side of its motion. On a sphere it
+    is nearer to its end.
     """
     if shape.kind == "sphere":
         normal = _tilted(motion, outward)

@@ -85,7 +85,7 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
     """Return the URDF with massless links merged into the links to which they are fixed.
 
     A massless link at the end of a branch is kept if it has shapes. The second result is a list of
-    one sentence on the merged links, or none; the third gives for each merged link the link that
+    one sentence on the merged links, or none. The third gives for each merged link the link that
     took it over.
     """
     taken: dict[str, str] = {}

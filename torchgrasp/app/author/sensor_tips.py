@@ -1,7 +1,8 @@
 """Sensor tips that a maker's file lacks: fingertips that reach farther, with a rounded end.
 
-A sensor tip is a ball at the end of a cylinder of the same radius, added to the collision shapes of
-the fingertip. The pad moves with it: its contact point by exactly the offset, its normal not.
+A sensor tip is a ball at the end of a cylinder of the same radius. It is added to the collision
+shapes of the fingertip. The pad moves with it: its contact point by exactly the offset, its normal
+not.
 """
 
 import dataclasses

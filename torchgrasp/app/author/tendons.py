@@ -2,7 +2,7 @@
 
 The equalities are `A q = b`, and the motors set `T q`, with the positions q of all joints. Where
 both leave some motion free, the joints are under-actuated: one motor pulls several by a tendon.
-Then a quasi-static rule gives the posture in free space: of all postures that the motors allow, the
+Then a quasi-static rule gives the posture in free space. Of all postures that the motors allow, the
 joints take that of least energy of their springs. Without springs they move as their dampers let
 them, and without dampers by equal weights.
 """
@@ -35,7 +35,7 @@ class Joints(NamedTuple):
     """The n joints of a mechanism: names, and springs and dampers by which they give way.
 
     `stiffness` [N m/rad], `damping` [N m s/rad], `spring` and `rest` [rad] (or with [N] and [m])
-    are those of each joint: `spring` is where its spring is at rest, `rest` where the file has it.
+    are those of each joint. `spring` is where its spring is at rest, `rest` where the file has it.
     """
 
     names: tuple[str, ...]
@@ -48,8 +48,8 @@ class Joints(NamedTuple):
 class Mechanism(NamedTuple):
     """How the joints of a hand move: every joint leads, follows or stands still.
 
-    `followers` are coupled joints by name, `still` the positions [rad or m] of joints that nothing
-    moves, and `told` a sentence for each choice.
+    `followers` are coupled joints by name, and `still` the positions [rad or m] of joints that
+    nothing moves. `told` has a sentence for each choice.
     """
 
     followers: dict[str, Mimic]

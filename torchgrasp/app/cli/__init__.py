@@ -103,8 +103,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
-    # The batches are small: a second thread costs more than it gains, and one gives the same bits
-    # on any machine.
+    # The batches are small: a second thread costs more than it gains. One thread gives the same
+    # bits on any machine.
     torch.set_num_threads(1)
     before = WORDS.set(tuple(given))
     try:
@@ -209,7 +209,7 @@ def _load(command: str | Callables) -> Callables:
 
 def _parser(first: str) -> SubcommandApp:
     """Return the argument parser of the commands that begin with the word `first`, or of all if
-    none does; commands of two words are grouped by the first word.
+    none does. Commands of two words are grouped by the first word.
     """
     wanted = [name for name in COMMANDS if name.split()[0] == first]
     top = SubcommandApp()

@@ -30,8 +30,8 @@ class Workplace:
     def place(self, name: str, text: str) -> Path:
         """Return the path below the folder that a text names, whether it exists or not.
 
-        Raises `BadArgument`, which calls the argument by `name`, for a path out of the folder, for
-        `..`, and for a link that leads out of it.
+        Raises `BadArgument`, which calls the argument by `name`, for a path out of the folder.
+        Raises it also for `..`, and for a link that leads out of it.
         """
         check_path(name, text)
         path = self.root / text

@@ -1,7 +1,7 @@
 """The server of `torchgrasp mcp`: the library as tools for agents, by the Model Context Protocol.
 
-Each call is worked on in a process of its own kind, which is ended at the time limit or when the
-client cancels the call. It also keeps what libraries print away from the protocol. One call is
+Each call is worked on in a process of its own kind. The process is ended at the time limit or when
+the client cancels the call. It also keeps what libraries print away from the protocol. One call is
 worked on at a time.
 """
 

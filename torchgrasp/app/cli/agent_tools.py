@@ -380,8 +380,8 @@ class PlanFromDepth(_PlanTool):
     """Plan grasps of an object in a depth image, and write them into a folder.
 
     The table and the objects are found in the image. A mask or a pixel chooses the object;
-    otherwise it is the easiest one. The answer is in the frame of camera_pose or, without it, in
-    the camera's frame (x right, y down, z forward).
+    otherwise it is the easiest one. The answer is in the frame of camera_pose. Without it, the
+    frame is the camera's (x right, y down, z forward).
     """
 
     depth: str = required(
@@ -803,8 +803,8 @@ TOOLS: dict[str, type[Tool]] = {
 def make_tool(name: str, given: dict[str, Any]) -> Tool:
     """Return a tool with its arguments, as an agent gives them: lists for tuples.
 
-    Raises `BadArgument` for an unknown tool, for unknown or missing arguments, and for values of
-    another type or outside their bounds.
+    Raises `BadArgument` for an unknown tool, and for unknown or missing arguments. Raises it also
+    for values of another type or outside their bounds.
 
     >>> make_tool("check_hand", {"hand": "barrett"})
     CheckHand(hand='barrett', fingers='default')

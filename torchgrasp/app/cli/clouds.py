@@ -72,8 +72,8 @@ class CloudCheck(ForPrograms):
         return int(refused)
 
     def judge(self) -> tuple[tuple[str, ...], clouds.CloudReport, tuple[clouds.Advice, ...]]:
-        """Return notes on the reading of the cloud, a report, and the refusal of a cloud that no
-        single camera sees.
+        """Return notes on the reading of the cloud, and a report. Return also the refusal of a
+        cloud that no single camera sees.
         """
         file = self.view.read("FILE", find_view(self.file, "FILE"), whole=True)
         file = inputs.without_exact_table(file, self.view.vertical)
@@ -91,7 +91,7 @@ class CloudCheck(ForPrograms):
 
 
 def _no_view(cloud: PointCloud) -> BadArgument | None:
-    """Return the error of `fit_shape` for a cloud that no single camera can see, or None if one
+    """Return the error of `fit_shape` for a cloud that no single camera can see. Return None if one
     camera can see it.
     """
     some = cloud.select(draw_rows(len(cloud), MOST_TRIED))
@@ -106,8 +106,8 @@ def _no_view(cloud: PointCloud) -> BadArgument | None:
 
 @arguments(points="cloud", path="out")
 class CloudCut(Command):
-    """Write the points of one object in a scene, without the points of the table, and the plane of
-    the table.
+    """Write the points of one object in a scene, without those of the table, and the plane of the
+    table.
     """
 
     cloud: Path = positional(

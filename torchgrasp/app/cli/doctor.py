@@ -132,7 +132,7 @@ class Selftest(Command):
     """Lift shipped grasps in each installed simulator, and compare the verdicts with the known
     ones.
 
-    The exit code is 0 if all verdicts are right, and 1 if one is wrong or no simulator is
+    The exit code is 0 if all verdicts are right. It is 1 if one is wrong or no simulator is
     installed.
     """
 

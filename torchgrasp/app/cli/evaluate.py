@@ -308,8 +308,8 @@ class RunCampaign(_Trials):
 
     Prints a line for each job, one object and view. Writes shards of safetensors with README.md and
     card.json, which torchgrasp.data.read_shards reads. The same command continues a run that was
-    interrupted or killed, and tries failed jobs again: worker_died, timed_out, and broken, an error
-    of the library. The exit code is 1 while failed jobs are left.
+    interrupted or killed. It also tries failed jobs again: worker_died, timed_out, and broken, an
+    error of the library. The exit code is 1 while failed jobs are left.
     """
 
     objects: Path = positional(OBJECTS_HELP)

@@ -218,9 +218,7 @@ def _given(**options: Any) -> dict[str, Any]:
 
 
 def _check_reached(grasps: Grasps, path: Path) -> None:
-    """Refuse an object that a format names if its mesh is on this machine, and the grasps do not
-    touch it.
-    """
+    """Refuse an object that a format names if its mesh is here, and the grasps do not touch it."""
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
         return
     mesh = load_triangles(read_bytes(path), path.suffix.lower())

@@ -77,7 +77,7 @@ OBJECT_WIDTHS = (-10, 7, -1)  # of the columns of a scene's objects
 
 @arguments(points="cloud", normals="cloud", path="out", target="label")
 class Grasp(ForPrograms):
-    """Plan grasps of an object in a partial cloud or a scene; with a mesh, also close the hand in
+    """Plan grasps of an object in a partial cloud or a scene. With a mesh, also close the hand in
     simulation.
 
     Writes grasps.safetensors, surface.ply, report.html and the 3D page view.html into the output
@@ -305,8 +305,8 @@ class Grasp(ForPrograms):
         among: Among,
         progress: StageProgress,
     ) -> tuple[Grasps, Explanation | None]:
-        """Return the grasps of a cloud or of a scene's target; if none is executable, also what
-        would help, but not with --edge.
+        """Return the grasps of a cloud or of a scene's target. If none is executable, return also
+        what would help, but not with --edge.
         """
         given = (source, hand, spec, self.starts, self.seed)
         options: dict[str, Any] = {"fingers": among, "mode": self.mode, "observer": progress.end}
@@ -324,8 +324,8 @@ class Grasp(ForPrograms):
         stands: Grasps,
         progress: StageProgress,
     ) -> EdgePlan | None:
-        """Return a drag to the table's edge with grasps there; None if there is none, or if the
-        grasps where the object `stands` are as likely to hold.
+        """Return a drag to the table's edge with grasps there. Return None if there is none, or if
+        the grasps where the object `stands` are as likely to hold.
         """
         plan = plan_edge_grasps(
             cloud,
@@ -356,8 +356,8 @@ class Grasp(ForPrograms):
         table: Plane | None,
         progress: StageProgress,
     ) -> Run:
-        """Return the run with the closing of its best grasp on the true mesh, after the drag if
-        there is one.
+        """Return the run with the closing of its best grasp on the true mesh. The closing follows
+        the drag if there is one.
         """
         friction = None if self.edge is None else self.table_friction
         trial = TrialSpec(friction=self._friction, mass=self._mass, table_friction=friction)
@@ -562,8 +562,8 @@ class Grasp(ForPrograms):
     def _find_easiest(
         self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: StageProgress
     ) -> tuple[Scene, Grasps, ShapeGP] | None:
-        """Plan for the objects of a scene until one is easy; return the scene with it as target,
-        grasps and shape, or None if no object has a grasp.
+        """Plan for the objects of a scene until one is easy. Return the scene with it as target,
+        grasps and shape. Return None if no object has a grasp.
         """
         options = {"fingers": among, "enough": ENOUGH, **self._task}
         plan = plan_scene(scene, hand, spec, self.starts, self.seed, **options)

@@ -189,11 +189,12 @@ class HandNew(Command):
 
 @arguments(path="out")
 class HandCheck(ForPrograms):
-    """List every fault of a hand; if there is none, describe and draw the hand, and plan on a
+    """List every fault of a hand. If there is none, describe and draw the hand, and plan on a
     shipped object.
 
-    Ends with a table of the hand's abilities, which abilities.json beside the picture holds, too:
-    spans of the fingertips, forces at the tips, widths that they can hold, and free postures.
+    Ends with a table of the hand's abilities, which abilities.json beside the picture holds, too.
+    These are spans of the fingertips, forces at the tips, widths that they can hold, and free
+    postures.
     """
 
     hand: str = positional(HAND_HELP)

@@ -40,8 +40,8 @@ class Import(Command):
     grasps.safetensors.
 
     `torchgrasp export` and `torchgrasp evaluate --planned` accept the file. The input is JSON of
-    `torchgrasp export`, JSON with "pose" and "dofs" (MultiGripperGrasp), .npz with DexGraspBench's
-    names, or .yaml of isaac_grasp 1.0.
+    `torchgrasp export`, or JSON with "pose" and "dofs" (MultiGripperGrasp). It may be .npz with
+    DexGraspBench's names, or .yaml of isaac_grasp 1.0.
     """
 
     file: Path = positional("the grasps, in the frame of the object")

@@ -228,8 +228,8 @@ def read_table(table: tuple[float, ...]) -> Plane | float:
 def with_edge(table: Plane | float | None, edge: tuple[float, ...]) -> Plane:
     """Return a table, a plane or a height z [m], that ends at the edge of --edge.
 
-    `edge` holds a point on the edge [m] and the direction away from the table, each by x and y, or
-    by x, y and z.
+    `edge` holds a point on the edge [m] and the direction away from the table. Each has x and y, or
+    x, y and z.
     """
     plane = as_plane(table)
     if plane is None:

@@ -44,8 +44,8 @@ PAPER = "#fcfcfa"
 INK = "#22262b"
 GRID = "#dcdad3"
 ALARM = "#c2452d"
-"""Colours of the background, of lines with text, of grid lines, and of the moment at which an
-object was lost.
+"""Colours of the background, of lines with text, and of grid lines. The last is for the moment at
+which an object was lost.
 """
 SIZE = (720, 576)  # width and height of a still [pixels]: twice its size on a page of three columns
 

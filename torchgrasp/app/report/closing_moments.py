@@ -87,7 +87,7 @@ def explain_loss(
     """Return a sentence on when and in which phase the object was lost, and on the cause.
 
     The cause is the finger that failed first, or the status of the closing. `centre` is the
-    object's centre of mass [m] in the frame of the grasp, where z is up; `fingers` are the names of
+    object's centre of mass [m] in the frame of the grasp, where z is up. `fingers` are the names of
     the fingers. The text is "" if the object was held.
     """
     tick = find_loss(closure, centre)
@@ -114,8 +114,8 @@ def explain_loss(
 
 
 def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) -> str:
-    """Return a text that names the finger that first slid or let go for good before a tick; "" if
-    none did.
+    """Return a text that names the finger that first slid or let go for good before a tick. It is
+    "" if none did.
     """
     touched = touching(closure)[: tick + 1]
     sliding = closure.trace.sliding[: tick + 1].nan_to_num(0.0)
@@ -145,7 +145,7 @@ def moments_of(
 ) -> list[Moment]:
     """Return the key moments that the film strip of a closing shows, in the order of time.
 
-    `centre` is the object's centre of mass [m] in the frame of the grasp, where z is up; `fingers`
+    `centre` is the object's centre of mass [m] in the frame of the grasp, where z is up. `fingers`
     are the names of the fingers.
     """
     found = [Moment(tick_of(closure, 0), "open hand")]

@@ -200,7 +200,7 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
 
 
 def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[Any]) -> None:
-    """Draw lines over time in one plot from 0 to `top`, with a legend if the title ends with a
+    """Draw lines over time in one plot from 0 to `top`. A legend is drawn if the title ends with a
     colon.
     """
     end = max(time[-1], time[0] + PLOTS.least_time)

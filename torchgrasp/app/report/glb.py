@@ -1,5 +1,5 @@
-"""A grasp as one GLB file, with the links of the hand and the object as coloured parts, for slides
-and 3D viewers.
+"""A grasp as one GLB file, for slides and 3D viewers. The links of the hand and the object are
+coloured parts.
 """
 
 import dataclasses

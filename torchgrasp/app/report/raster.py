@@ -20,8 +20,8 @@ class RasterNumbers:
     opacity: float = 0.5  # opacity of transparent triangles, in [0, 1]
     nearest: float = 1e-6  # least distance from the camera [m]; the scene is framed in front of it
     thinnest: float = 1e-9  # twice the least area [pixels]: seen from its edge, a triangle is thin
-    # Triangles that share an edge both cover a centre within this distance [pixels] of it, so that
-    # no crack is left between them.
+    # Triangles that share an edge both cover a centre within this distance [pixels] of it. So no
+    # crack is left between them.
     tie: float = 1e-6
 
 
@@ -125,8 +125,7 @@ def _cast(
     focal = height / 2 / np.tan(camera.angle / 2)
     x = width / 2 + focal * local[..., 0] * near
     y = height / 2 - focal * local[..., 1] * near
-    # A value that is linear in space is, divided by its distance, linear on the screen:
-    # a x + b y + c.
+    # A value linear in space is, divided by its distance, linear on the screen: a x + b y + c.
     values = np.concatenate([near[..., None], _shade(triangles, camera) * near[..., None]], -1)
     screen = np.stack([x, y, np.ones_like(x)], -1)
     seen = np.abs(np.linalg.det(screen)) > RASTER.thinnest

@@ -140,8 +140,8 @@ def verdict(run: Run) -> str:
 def closing_sentence(run: Run) -> str:
     """Return one sentence with the result of the closing on the true object.
 
-    If the object was held, it says how far it rose [m], and how it moved in the hand [mm, deg];
-    otherwise why not.
+    If the object was held, it says how far it rose [m], and how it moved in the hand [mm, deg].
+    Otherwise it says why not.
     """
     upright = run.upright()
     closure = upright.closure

@@ -162,8 +162,8 @@ def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "
 
 
 def _squares(image: DepthImage, table: Plane) -> Float[np.ndarray, "h w"]:
-    """Return for each pixel, in [0, 1], how well it lies on the lines of a 10 cm grid in the table
-    plane.
+    """Return for each pixel how well it lies on the lines of a 10 cm grid in the table plane.
+    Results are in [0, 1].
     """
     ones = torch.ones_like(image.depth)
     flat = DepthImage(ones, image.intrinsics, image.obj_from_camera).points()

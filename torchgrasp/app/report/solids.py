@@ -1,5 +1,5 @@
-"""A hand as meshes to draw, in the colours of the fingers: the visual meshes of its URDF, or
-collision shapes with rounded edges.
+"""A hand as meshes to draw, in the colours of the fingers. They are the visual meshes of its URDF,
+or collision shapes with rounded edges.
 """
 
 import functools
@@ -49,8 +49,8 @@ class Solid(NamedTuple):
 def solids_of_links(hand: Hand) -> list[Solid]:
     """Return the hand as meshes, each in the frame of its link.
 
-    A link whose URDF has a <visual> that can be read is drawn as that mesh, any other link by its
-    collision shapes.
+    A link whose URDF has a <visual> that can be read is drawn as that mesh. Any other link is drawn
+    by its collision shapes.
     """
     if "solids" not in hand.derived:
         hand.derived["solids"] = _read_solids(hand)

@@ -194,7 +194,7 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
     """Return a PNG of a hand at a posture, with its fingertip normals and the axes of its palm.
 
-    `joints` [rad] are the positions of the h actuated joints; `eye` is the direction to the camera,
+    `joints` [rad] are the positions of the h actuated joints. `eye` is the direction to the camera,
     in the hand's frame.
     """
     solids = solids_from_hand(
@@ -284,8 +284,8 @@ def mesh_arrays(surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _grasp(
     surface: Surface | None, hand: Hand, grasp: Grasps
 ) -> tuple[paint.Canvas, Float[np.ndarray, "n 3"]]:
-    """Return a canvas with the surface and the first grasp's hand and contacts, and the points that
-    must be in view.
+    """Return a canvas with the surface and the first grasp's hand and contacts. Return also the
+    points that must be in view.
     """
     joints = hand.expand_joints(grasp.joints[0].double())
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])

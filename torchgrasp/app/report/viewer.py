@@ -85,8 +85,8 @@ def write_viewer(path: Path | str, run: Run) -> Path:
 
     * the cloud, and the surface coloured by its standard deviation;
     * the surface moved by a chosen number of standard deviations;
-    * the best 20 grasps with their contacts, each in four postures: approach, pre-grasp, grasp and
-      squeeze (the target of the finger drives);
+    * the best 20 grasps with their contacts, each in four postures. They are approach, pre-grasp,
+      grasp and squeeze (the target of the finger drives);
     * a replay of the run's closing with its forces.
 
     The address may name a state: `view.html#grasp=3&posture=squeeze&sigma=2` or
@@ -126,8 +126,8 @@ def show_grasps(
         hand: the hand of the grasps; None means the shipped hand that `grasps.meta` names.
         browser: whether the page is opened; False only writes it.
 
-    Raises `BadArgument` for a cloud that the grasps do not touch, and for a hand other than that of
-    the grasps. Without `hand` it is also raised if the grasps name no hand.
+    Raises `BadArgument` for a cloud that the grasps do not touch. Raises it also for a hand other
+    than that of the grasps. Without `hand` it is also raised if the grasps name no hand.
 
     >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
