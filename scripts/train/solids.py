@@ -55,8 +55,8 @@ Families = dict[str, Callable[[Draw], Thing]]
 
 
 def family(families: Families, **sizes: tuple[float, float]) -> Callable[[Callable], Callable]:
-    """Enter a maker into a table under its name, with the limits between which its sizes are drawn,
-    one after another.
+    """Enter a maker into a table under its name. Its sizes are drawn between the given limits, one
+    after another.
     """
 
     def enter(make: Callable[..., Thing]) -> Callable[..., Thing]:

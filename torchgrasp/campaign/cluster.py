@@ -81,8 +81,8 @@ def run_on_cluster(
                     found = f"{address!r}, which ended during the work"
                     allowed = "a scheduler that goes on; the same call continues"
                     raise BadArgument("workers", found, allowed) from error
-                # a result that was yielded leaves the memory, whatever else holds its future, as
-                # the traceback of a worker that died may
+                # a result that was yielded leaves the memory; the traceback of a worker that died
+                # may hold its future
                 future.release()
                 del future
                 submit(1)

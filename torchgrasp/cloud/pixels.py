@@ -19,7 +19,8 @@ class PixelNumbers:
     """Parameters of the search for the camera from which a cloud is regular.
 
     The irregularity of a camera is the mean deviation of the angles between neighbouring pixels
-    from their median, over the median. It is about 0 for a lattice, and a third for random points.
+    from their median. It is divided by the median. It is about 0 for a lattice, and a third for
+    random points.
     """
 
     least: int = 100

@@ -1,7 +1,7 @@
 """The least friction at which contacts can balance, and the forces that need it.
 
-Forces f_i on the object with the outward normals n_i have the normal parts a_i = -n_i . f_i, and
-the tangential parts t_i. G maps them to their total force and torque. The critical friction is the
+Forces f_i on the object have the normal parts a_i = -n_i . f_i, and the tangential parts t_i. n_i
+are the outward normals. G maps them to their total force and torque. The critical friction is the
 least mu for which
 
     G f = 0,    sum a_i = number of contacts,    x_i = (mu a_i, t_i) in the cone |t_i| <= mu a_i
@@ -13,9 +13,9 @@ linear map M_i, for which x_i = M_i f_i, the best forces satisfy
 
 The twist y is a motion of the object, along which friction of the coefficient mu just stops all
 contacts. Newton's method with the scaling of Nesterov and Todd [1] solves the equations for falling
-nu. In a frame of the contact, whose first axis is the inward normal, M_i is diag(mu, 1, 1), and the
-form of the cone is J = diag(1, -1, -1). With the scaling point w of x and s, the matrix
-D = (2 J w w^T J - J) / beta maps x to s. Its inverse is beta (2 w w^T - J).
+nu. Take a frame of the contact whose first axis is the inward normal. In it M_i is diag(mu, 1, 1),
+and the form of the cone is J = diag(1, -1, -1). With the scaling point w of x and s, the matrix D =
+(2 J w w^T J - J) / beta maps x to s. Its inverse is beta (2 w w^T - J).
 
 [1] Andersen, Roos and Terlaky, Mathematical Programming 95, 2003.
 """
@@ -60,7 +60,7 @@ class CriticalNumbers:
     shorter: tuple[float, ...] = (1.0, 0.8, 0.5, 0.2, 0.05)
     """Shares of a step that are tried, since the product mu a_i is not linear."""
     power: float = 0.6
-    """Exponent of the part of nu that the next step keeps; the base is what a step to nu = 0 leaves
+    """Exponent of the part of nu that the next step keeps. The base is what a step to nu = 0 leaves
     undone.
     """
     short: float = 0.3
@@ -146,7 +146,7 @@ def least_balance(
 
     The balances are differentiable twice in all arguments. Where several motions of the object
     prove the friction, its derivative is that of one of them. Inside torch.vmap, all sets have an
-    index; the friction of those that cannot balance is NaN, and their other fields mean nothing.
+    index. For those that cannot balance the friction is NaN, and the other fields mean nothing.
 
     Args:
         points: positions [m] of f contacts.
@@ -180,8 +180,8 @@ def _follow(
     found: LeastBalance, points: Vectors, normals: Vectors, load: Float[Tensor, "b 6"]
 ) -> LeastBalance:
     """Return the same balances, with their derivatives by points, normals and load."""
-    # Newton's steps at the solution change the derivatives alone: the first step those of first
-    # order, the second step those of second order.
+    # Newton's steps at the solution change the derivatives alone. The first step changes those of
+    # first order, the second step those of second order.
     equations = _Equations.of(points, normals, load)
     for _ in range(2):
         found = equations.refined(found)
@@ -197,7 +197,7 @@ class _Search(torch.autograd.Function):
     """The search for balances, without derivatives.
 
     Its results are the mask of the contact sets that can balance, and the fields of their
-    `LeastBalance`; those of others are NaN.
+    `LeastBalance`. The fields of other sets are NaN.
     """
 
     @staticmethod
@@ -463,8 +463,8 @@ class _Cones(NamedTuple):
         return _by_row(self.rows[:6] * forces) + self.constants[:6]
 
     def nearer(self, at: _Balance) -> _Balance:
-        """Return the balance after a whole step to the last nu, or the same one if the step would
-        leave a cone, as on a kink.
+        """Return the balance after a whole step to the last nu. If the step would leave a cone, as
+        on a kink, return the same balance.
         """
         whole = torch.ones_like(at.friction)
         scaling = _Scaling.of(at, self.flip)
@@ -527,8 +527,8 @@ class _Cones(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """The equations of balances, for their derivatives: the normals, the rows of G and of the sum
-    of normal forces (b, 7, f, 3), and the load that the forces balance.
+    """The equations of balances, for their derivatives. They hold the normals, the rows of G and of
+    the sum of normal forces (b, 7, f, 3), and the load that the forces balance.
     """
 
     normals: Vectors
@@ -560,8 +560,8 @@ class _Equations(NamedTuple):
         """Return the Jacobian and the residual of the q = 7 f + 8 equations.
 
         The unknowns are forces, press, slide, friction, twist and scale. The equations are those of
-        balance and sum, of the multipliers by contact, of sum a_i s_i0, and of x_i o s_i: its first
-        number, then the others, by contact.
+        balance and sum, of the multipliers by contact, of sum a_i s_i0, and of x_i o s_i. Of the
+        last, the first number comes first, then the others, by contact.
         """
         n = self.normals[..., None]  # (b, f, 3, 1)
         mu = at.friction[:, None, None, None]
@@ -601,7 +601,7 @@ class _Equations(NamedTuple):
 
 
 def _sum(x: Float[Tensor, "*a b"], axis: int) -> Float[Tensor, "*c b"]:
-    """Return sums over a short axis, term by term: the order of a longer sum of torch depends on
+    """Return sums over a short axis, term by term. The order of a longer sum of torch depends on
     the number of contact sets.
     """
     return functools.reduce(torch.add, x.unbind(axis))
@@ -632,8 +632,8 @@ def _solved(
 
 
 def _by_contact(*blocks: Float[Tensor, "b f r _"]) -> Float[Tensor, "b m q"]:
-    """Return the rows of equations that stand for each contact: its blocks for forces, press and
-    slide on the diagonals, then that of the common friction.
+    """Return the rows of equations that stand for each contact. They are its blocks for forces,
+    press and slide on the diagonals, then that of the common friction.
     """
     *own, common = blocks
     f = common.shape[1]

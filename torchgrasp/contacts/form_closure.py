@@ -3,7 +3,7 @@ with round cones.
 
 **The margin.** W holds the m contact wrenches a_k, and a is their mean. The linear programme is:
 maximise s with W phi = 0, sum phi = 1, phi >= s. With c_k = m (a - a_k) its dual is: maximise a.v
-with c_k.v <= 1, in six unknowns v; then s = 1/m - a.v. The point v = 0 is feasible, so the simplex
+with c_k.v <= 1, in six unknowns v. Then s = 1/m - a.v. The point v = 0 is feasible, so the simplex
 method needs no first phase. At the optimum six constraints are tight, and a = sum lambda_k c_k over
 these six with lambda >= 0. Then
 
@@ -97,10 +97,9 @@ def tangents(points: Vectors, normals: Vectors) -> Vectors:
     cone leans along it.
 
     The tangent rotates with the object. With three contacts it lies in their plane. With four or
-    five, it lies in the plane of three of them: those whose plane is most perpendicular to the
-    tangent plane, weighted by the area of their triangle. The tangent is arbitrary where no plane
-    gives one and friction cannot give closure. `points` and outward unit `normals` have the shape
-    (b, f, 3).
+    five, it lies in the plane of three of them. Their plane is most perpendicular to the tangent
+    plane, weighted by the area of their triangle. The tangent is arbitrary where no plane gives one
+    and friction cannot give closure. `points` and outward unit `normals` have the shape (b, f, 3).
     """
     corners = subsets(points.shape[1], 3, points.device)
     first, second, third = (points[:, corner] for corner in corners.unbind(1))
@@ -209,10 +208,11 @@ def maximise(
 ) -> tuple[Float[Tensor, "b d"], Int[Tensor, "b d"], Float[Tensor, "b d"]]:
     """Return the solutions of b linear programmes: maximise a.v with c_k.v <= 1 for m bounds c_k.
 
-    `objective` holds a, and `bounds` the c_k, each of d numbers. Three results are returned: the
-    best v, or a direction in which a.v grows without bound; the indices of the d bounds that are
-    tight; and their multipliers. The simplex method runs for all programmes at once, until all are
-    optimal. The point v = 0 is feasible, so there is no first phase.
+    `objective` holds a, and `bounds` the c_k, each of d numbers. Three results are returned. The
+    first is the best v, or a direction in which a.v grows without bound. The others are the indices
+    of the d bounds that are tight, and their multipliers. The simplex method runs for all
+    programmes at once, until all are optimal. The point v = 0 is feasible, so there is no first
+    phase.
     """
     b, _, d = bounds.shape
     tight, ray = _pivot(objective, bounds)
@@ -319,12 +319,12 @@ def _first_wrenches(points: Vectors, normals: Vectors, friction: float) -> Wrenc
 
 
 def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
-    """Return a mask of the sets of three contacts that have force closure: balanced forces lie in
+    """Return a mask of the sets of three contacts that have force closure. Balanced forces lie in
     the plane of the contacts.
 
     Each friction cone cuts an angle from the plane. The six planar wrenches along the sides of
-    these angles must positively span all planar wrenches: no plane through two of the wrenches has
-    the others on one side.
+    these angles must positively span all planar wrenches. So no plane through two of the wrenches
+    has the others on one side.
     """
     arm = scaled_arms(points)
     first, second, third = arm.unbind(1)
@@ -348,8 +348,8 @@ def _spans_plane(
 ) -> Bool[Tensor, "b"]:
     """Return a mask of the sets of three planar cones that positively span all planar wrenches.
 
-    A cone has its apex at a `position`, and its axis along `inward`, with an angle `half` [rad]
-    between axis and sides.
+    A cone has its apex at a `position`, and its axis along `inward`. The angle between axis and
+    sides is `half` [rad].
     """
     middle = torch.atan2(inward[..., 1], inward[..., 0])
     angle = torch.stack([middle - half, middle + half], -1)  # (b, 3, 2)

@@ -3,7 +3,7 @@ contact sets.
 
 The loop computes the constraints of `ContactProblem`, and the steps of `levenberg_marquardt` with
 `Descent`. It takes stages that are not exact, on one shape with one surface and a thin-plate
-kernel, without a region and without an edge of the table.
+kernel. It takes neither a region nor an edge of the table.
 """
 
 import collections

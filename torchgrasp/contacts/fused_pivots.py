@@ -86,7 +86,7 @@ def pivot(
     bounds: Float[Tensor, "b m d"],
     numbers: tuple[int, float, float, float],
 ) -> tuple[Int[Tensor, "b d"], Float[Tensor, "b d"]]:
-    """Return the results of `_pivot` of `form_closure`; the numbers are its bounds of pivots, zero
+    """Return the results of `_pivot` of `form_closure`. The numbers are its bounds of pivots, zero
     multipliers, the artificial rows' gain and parallel bounds.
     """
     tight = objective.new_full(objective.shape, -1).long()

@@ -1,28 +1,29 @@
 """The probability that contacts have force closure although friction, finger placement and normals
 are uncertain.
 
-Contacts close where the friction coefficient exceeds the critical friction mu_c. To first order,
-contacts that move by u_i and normals that turn by w_i, both along the surface, change mu_c by
+Contacts close where the friction coefficient exceeds the critical friction mu_c. Contacts may move
+by u_i and normals turn by w_i, both along the surface. To first order this changes mu_c by
 
     sum_i (f_i x y / r) . u_i + (mu_c s_i0 f_i - a_i s_i) . w_i
 
 with the symbols of `torchgrasp.contacts.critical`, of the twist y only the rotation, and the
-root-mean-square radius r of the contacts. An object that is displaced by v, and turned by z about
-the centroid p of its contacts p_i, moves all contacts together. Then u_i is the part of
-v + z x (p_i - p) along the surface. Under a weight w, a change of the mass by the share e and of
-the centre of mass by d changes mu_c by
+root-mean-square radius r of the contacts. An object that is displaced by v, and turned by z about a
+point p, moves all contacts together. Here p is the centroid of its contacts p_i. Then u_i is the
+part of v + z x (p_i - p) along the surface. Under a weight w, the mass may change by the share e,
+and the centre of mass by d. This changes mu_c by
 
     e y . w + (w_f x y / r) . d,    w_f the force of w.
 
 An interval of masses is split into ranges, each of which counts as a Gaussian error. So small
 Gaussian errors make mu_c Gaussian, with a standard deviation s. Then the friction m suffices with
-the probability Phi((m - mu_c) / s), whose mean for m in an interval [a, b] is
+the probability Phi((m - mu_c) / s). Its mean for m in an interval [a, b] is
 
     s (Psi((b - mu_c) / s) - Psi((a - mu_c) / s)) / (b - a),    Psi(x) = x Phi(x) + Phi'(x).
 
 Planned contacts are near kinks of mu_c, where first order is good for small errors alone. So the
-errors e are a mixture: e = e_k + h e', with h e' small, and k one of a fixed set of points e_k that
-are spread as sqrt(1 - h^2) e. First order counts around each point, and the result is the mean.
+errors e are a mixture: e = e_k + h e', with h e' small. Here e_k is one of a fixed set of points
+that are spread as sqrt(1 - h^2) e. First order counts around each point, and the result is the
+mean.
 """
 
 import dataclasses
@@ -63,13 +64,13 @@ class HoldProbabilityNumbers:
     points: int = 64
     """Number of errors around which the critical friction is found and linearised."""
     local: float = 0.2
-    """Standard deviation of the errors around each of them, as a share of the whole one: where the
+    """Standard deviation of the errors around each of them, as a share of the whole one. Where the
     critical friction has a kink, the result is too high by about as much.
     """
     rows: int = 2**15
     """Rows, contact sets with one error each, that are computed at a time: this bounds memory."""
     narrow: float = 1e-4
-    """An interval shorter than this, in standard deviations, counts as its middle: the difference
+    """An interval shorter than this, in standard deviations, counts as its middle. The difference
     of Psi would be lost in rounding.
     """
     parts: int = 2**20
@@ -134,14 +135,14 @@ def hold_probability(
     """Return the probability (b,) that each contact set has force closure, for uncertain friction,
     finger placement, normals and object pose.
 
-    With a `weight`, the result is the probability that forces in the friction cones balance the
-    weight, with the mean normal force `weight.press`. With a `shape`, the result is the mean over
+    With a `weight`, the result is the probability that forces in the friction cones balance it.
+    They have the mean normal force `weight.press`. With a `shape`, the result is the mean over
     random surfaces.
 
-    If only the friction is uncertain, the result is exact: the probability that the friction
+    If only the friction is uncertain, the result is exact. It is the probability that the friction
     exceeds the `critical_friction`, and 0 where that is infinite. The other errors count by the
     mean over a fixed set of 64 errors. Around each of these, smaller errors count to first order.
-    The result is 0 for the few sets for which the method does not converge; most of them carry a
+    The result is 0 for the few sets for which the method does not converge. Most of them carry a
     load far below the normal forces.
 
     Args:
@@ -268,7 +269,7 @@ class _Errors:
 
 @functools.lru_cache(maxsize=16)
 def _spread_evenly(count: int, numbers: int) -> list[list[float]]:
-    """Return a fixed set of `count` errors, each of some normal numbers: every number takes each of
+    """Return a fixed set of `count` errors, each of some normal numbers. Every number takes each of
     `count` equally likely values once (Latin hypercube sampling).
 
     What is left to the errors around them is not in it.
@@ -307,7 +308,7 @@ def _held(
     burden: _Burden | None = None,
 ) -> Float[Tensor, "b"]:
     """Return the probability that each contact set balances, with a friction of the distribution
-    `law`, and 0 for those that cannot.
+    `law`. It is 0 for sets that cannot.
     """
     load = None if burden is None else burden.wrench(points)
     rows, balance = least_balance(points, normals, load)
@@ -367,7 +368,7 @@ def _center(weight: CarriedWeight, points: Vectors) -> Float[Tensor, "b 3"]:
 
 
 def _tilts(tilt: float | Tensor, points: Vectors) -> Float[Tensor, "b f"]:
-    """Return the standard deviation [rad] of each normal; raise `BadArgument` if there is not one
+    """Return the standard deviation [rad] of each normal. Raise `BadArgument` if there is not one
     for each contact, or one is out of range.
     """
     if not isinstance(tilt, Tensor):
@@ -386,7 +387,7 @@ def sensitivities(
     points: Vectors, normals: Vectors, balance: LeastBalance
 ) -> tuple[Vectors, Vectors]:
     """Return the derivatives of the critical friction by points [1/m] and by normals, along the
-    surface; `balance` is that of the contacts.
+    surface. `balance` is that of the contacts.
     """
     _, radius = centre_and_radius(points)
     rotation = balance.twist[:, None, 3:].expand_as(points)

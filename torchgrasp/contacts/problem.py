@@ -1,13 +1,13 @@
 """The contact planning problem, Eqs. (10)-(14) of the paper, for a batch of contact sets.
 
-Unknowns x of a contact set are its f normalised points (f, 3) and a tension for each of the p pairs
-of points. The two points of a pair pull each other with the force tension times distance. A jet is
-the value of a function at points, together with its derivatives. Eq. (11) defines the normals. Eq.
-(13) asks for balanced forces in the friction cones. Three forces balance if and only if each force
-is the sum of the pulls along the two sides at its contact [1]. At four or five contacts, pulls
-between all pairs balance too, and give every balance unless the contacts lie in one plane. So W phi
-= 0 in Eq. (13) holds for all tensions, and one inequality for each friction cone is left. Every
-inequality has the form: value <= 0.
+Unknowns x of a contact set are its f normalised points (f, 3) and p tensions. There is a tension
+for each pair of points. The two points of a pair pull each other with the force tension times
+distance. A jet is the value of a function at points, together with its derivatives. Eq. (11)
+defines the normals. Eq. (13) asks for balanced forces in the friction cones. Three forces balance
+if and only if each force is the sum of two pulls. They are along the two sides at its contact [1].
+At four or five contacts, pulls between all pairs balance too. They give every balance unless the
+contacts lie in one plane. So W phi = 0 in Eq. (13) holds for all tensions, and one inequality for
+each friction cone is left. Every inequality has the form: value <= 0.
 
 [1] Yoshikawa and Nagai, IEEE Trans. Robotics and Automation 7, 1991.
 """
@@ -75,8 +75,8 @@ class ShapeLike(Protocol):
 
     @property
     def std_factor(self) -> PerRow:
-        """The factor (no unit) by which the posterior's standard deviations are multiplied to give
-        those of the true surface: a number, or (b,) as for `scale`.
+        """The factor (no unit) on the posterior's standard deviations that gives those of the true
+        surface. It is a number, or (b,) as for `scale`.
         """
         ...
 
@@ -199,7 +199,7 @@ def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
     """Return the signed incidence matrix of f contacts and their p = f (f - 1) / 2 pairs.
 
     The pairs are in the order of `contact_pairs`. The sign is 1 where contact i is the first of
-    pair k, -1 where it is the second, else 0. `fingertips` is f.
+    pair k. It is -1 where it is the second, else 0. `fingertips` is f.
     """
     pairs = contact_pairs(fingertips, device)
     at = torch.arange(fingertips, device=device)[:, None]
@@ -224,11 +224,12 @@ class Constraints(Batch):
     p tensions.
 
     `centre` (normalised) is the centroid of the f contacts, and `surface` (normalised) their signed
-    distances from the surface; both should be 0. The k numbers in `bounds` should be <= 0. First
-    come f friction cones (differences of cosines), then f variances (the excess over the limit,
-    divided by the slope of the variance there). All further ones are normalised lengths: f domain
-    limits, p distances between fingertips, with a table f heights, and with a region f distances
-    from it. `centre_by_x`, `surface_by_x` and `bounds_by_x` are the Jacobians of the three.
+    distances from the surface. Both should be 0. The k numbers in `bounds` should be <= 0. First
+    come f friction cones, as differences of cosines. Then come f variances: the excess over the
+    limit, divided by the slope of the variance there. All further ones are normalised lengths: f
+    domain limits, p distances between fingertips. With a table f heights follow, and with a region
+    f distances from it. `centre_by_x`, `surface_by_x` and `bounds_by_x` are the Jacobians of the
+    three.
     """
 
     centre: Float[Tensor, "b 3"]
@@ -313,11 +314,11 @@ class ContactProblem:
     The units are those of one shape, or of one shape for each contact set. `spec` holds the
     constraints in metres; all else is normalised. `friction` is the coefficient of the largest
     round cone inside the friction cone with flat sides that `certify` uses. `domain_radius` is that
-    of the shape. `separation` is the least distance of two fingertip centres, `tip_radius` the
-    radius of the fingertips, and `ring` the radius within which the surface is flat. `table` are
-    the faces of the table: none without a table, its top, and its side if it has an edge. `beyond`
-    returns the signed distance (q,) of normalised points (q, 3) from the region where contacts may
-    be, negative inside.
+    of the shape. `separation` is the least distance of two fingertip centres, and `tip_radius` the
+    radius of the fingertips. `ring` is the radius within which the surface is flat. `table` are the
+    faces of the table. They are none without a table, its top, and its side if it has an edge.
+    `beyond` returns the signed distance (q,) of normalised points (q, 3) from the region where
+    contacts may be, negative inside.
     """
 
     spec: ContactSpec

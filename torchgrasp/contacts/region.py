@@ -42,8 +42,8 @@ class Region(Value):
         distance: function of points (n, 3) [m] in float64 that returns their signed distances (n,)
             [m], negative inside.
         name: name of the region in errors.
-        placed: whether the region must be at the object, as a box or a mesh. If it is off the
-            cloud and the space behind the cloud, planning raises `BadArgument` for `keep`, and
+        placed: whether the region must be at the object, as a box or a mesh. It may be off the
+            cloud and the space behind the cloud. Then planning raises `BadArgument` for `keep`, and
             warns `NoEffect` for `avoid`. If it holds all of both, `keep` warns `NoEffect`.
 
     >>> from torchgrasp import load_object

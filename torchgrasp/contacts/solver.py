@@ -3,7 +3,7 @@
 After every step one Newton step on the mean signed distance brings the points back to the surface.
 This projection costs a fraction of a full evaluation, and allows long steps. Lengths are
 normalised. Letters in shapes: a contact sets, f contacts and p pairs of a set, r constraints, u
-unknowns (3 f coordinates, then p tensions, which `contacts.problem` explains).
+unknowns. The unknowns are 3 f coordinates, then p tensions, which `contacts.problem` explains.
 """
 
 import dataclasses
@@ -80,8 +80,8 @@ class State(Batch):
     """The solver's state for b contact sets of f contacts.
 
     `points` (b, f, 3) are the normalised contacts. `tension` (b, p) is that of each of p pairs of
-    contacts (see `contacts.problem`), scaled so that the mean size of the contact forces is 1.
-    `jet` holds signed distance and variance of the surface at the points, with derivatives.
+    contacts (see `contacts.problem`). It is scaled so that the mean size of the contact forces is
+    1. `jet` holds signed distance and variance of the surface at the points, with derivatives.
     """
 
     points: Vectors
@@ -218,8 +218,8 @@ def descend(shape: ShapeLike, problem: ContactProblem, state: State, stage: Stag
 
 
 def _is_fused(shape: ShapeLike, problem: ContactProblem, state: State) -> TypeGuard[ShapeGP]:
-    """Return whether the compiled loop can compute: with one surface of a thin plate, and without a
-    region or an edge of the table.
+    """Return whether the compiled loop can compute. It can with one surface of a thin plate, and
+    without a region or an edge of the table.
     """
     if not (type(shape) is ShapeGP and is_fused(state.points, shape.x, shape.weights)):
         return False

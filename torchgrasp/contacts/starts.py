@@ -81,7 +81,7 @@ class FlatCandidates(NamedTuple):
     """Constraints with a known `flat_radius`, and p candidate contacts where the surface is flat.
 
     `spec` holds the constraints. `candidates` are the normalised points (p, 3), and the outward
-    unit normals (p, 3) there; None if the surface need not be flat.
+    unit normals (p, 3) there. They are None if the surface need not be flat.
     """
 
     spec: ContactSpec
@@ -95,8 +95,8 @@ def drawn_starts(
     time.
 
     Without flatness in the spec of `settled` the guesses are drawn as in the paper (Sec. 6.2). With
-    flatness they are sets of its candidate contacts, because the centroid of contacts on flat
-    surface may lie far from the object's centre.
+    flatness they are sets of its candidate contacts. The centroid of contacts on flat surface may
+    lie far from the object's centre.
     """
     spec, candidates = settled
     generator = torch.Generator().manual_seed(seed)
@@ -116,9 +116,9 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
     """Return the constraints with a known `flat_radius`, and candidate contacts.
 
     A radius that is not given is the largest of `FLAT_RADII` with which enough guesses have force
-    closure, or else the least of them. The candidates are the points at which the surface is
-    flat, or all points of `survey` if too few points are flat. They are None if `spec` demands no
-    flatness.
+    closure. If there is none, it is the least of them. The candidates are the points at which the
+    surface is flat. They are all points of `survey` if too few points are flat. They are None if
+    `spec` demands no flatness.
     """
     if spec.flatness is None:
         return FlatCandidates(spec, None)
@@ -194,7 +194,8 @@ def qualify(
     points.
 
     `points` (b, f, 3) are normalised; the normals are outward unit vectors. A contact may lie on
-    the surface, where its variance is low, in the domain, above the table, and in the region.
+    the surface, where its variance is low, and in the domain. It must also be above the table, and
+    in the region.
     """
     problem = ContactProblem.of(shape, spec)
     distance, gradient = (

@@ -1,4 +1,4 @@
-"""Controllers of a real or simulated hand: from a grasp and sensor readings they compute targets of
+"""Controllers of a real or simulated hand. From a grasp and sensor readings they compute targets of
 the joints and the palm.
 """
 

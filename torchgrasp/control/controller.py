@@ -1,7 +1,7 @@
 """The controller of a grasp: an approach that stops at a touch, then closing, then holding.
 
 It needs no simulator. Vectors are in the frame of the planned hand (its root link), unless said
-otherwise; a tick is one period of control.
+otherwise. A tick is one period of control.
 """
 
 import dataclasses
@@ -51,7 +51,7 @@ class GraspController:
     `step` must still be called at each tick.
 
     If the plan has a table and `options` allow several attempts, the grasp is judged before the
-    lift. If it seems too weak to lift the object, the hand opens, locates the object from its
+    lift. If it seems too weak to lift the object, the hand opens. It locates the object from its
     touches and closes again.
 
     With `approach` > 0 the opened hand starts away from its pre-grasp, the pose from which the
@@ -179,15 +179,15 @@ class GraspController:
         """The `Distribution` of the object's mass [kg] that the felt load shows.
 
         None unless the hand holds in the mode "grip" and its load is steady. If the object is too
-        heavy for the hand (`status`), it reaches from the mass that was carried to 10 kg
-        (`WEIGHT.most`).
+        heavy for the hand (`status`), the distribution begins at the mass that was carried. It ends
+        at 10 kg (`WEIGHT.most`).
         """
         return self.hold.mass if isinstance(self.hold, GripHold) else None
 
     @property
     def blend(self) -> Float[Tensor, " f"]:
-        """The share of force control (f,) of each finger at the last tick, from 0 to 1: lambda in
-        Eq. (26) of the paper.
+        """The share of force control (f,) of each finger at the last tick, from 0 to 1. It is
+        lambda in Eq. (26) of the paper.
 
         NaN while Eq. (25) does not command the fingers, as in closings without this law. In others
         it is NaN before the first tick, in the hold, and while the hand opens again.

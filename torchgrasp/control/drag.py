@@ -68,8 +68,8 @@ DRAGGING = DragControlNumbers()
 class DragController:
     """Controller that drags an object with a hand. Each `step` maps an `Observation` to `Targets`.
 
-    The joints keep their posture. The palm starts 50 mm (`DRAGGING.height`) above its planned pose
-    and comes down until the fingertips press with the planned force. Then it moves along by the
+    The joints keep their posture. The palm starts 50 mm (`DRAGGING.height`) above its planned pose.
+    It comes down until the fingertips press with the planned force. Then it moves along by the
     planned displacement, and rises. An arm must keep the palm at `Targets.palm`. The sensors of the
     pressing fingers must measure forces.
 

@@ -64,7 +64,7 @@ def desired_forces(
     """Return balanced fingertip forces [N] on the object that need the least friction
     (`least_friction_forces`).
 
-    `points` [m] and outward unit `normals` are those of the f contacts, in any frame; the forces
+    `points` [m] and outward unit `normals` are those of the f contacts, in any frame. The forces
     are in the same frame. The largest normal force is `strongest` [N]. `preferred` holds wanted
     normal forces of the fingers, of which only the ratios count; None means equal ones. Where no
     balanced forces press at every contact, each force is `strongest` along the inward normal.
@@ -107,10 +107,10 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
     * `torques` (g, h) [N m or N]: efforts of the actuated joints that exert these forces.
 
     The targets solve J^T f = K (target - q). Here q are the joints of the grasp, f the forces,
-    and J the Jacobian of the contacts. K is diagonal: each actuated joint has the `kp` of its
-    own drive and of the joints coupled to it, times their squared ratios. If no forces that
-    press at every contact balance, each force is `force` along the inward normal. The targets
-    are differentiable in the joints of the grasps. The forces, found by a search, are not
+    and J the Jacobian of the contacts. K is diagonal. Each actuated joint has the `kp` of its own
+    drive and of the joints coupled to it, times their squared ratios. If no forces that press at
+    every contact balance, each force is `force` along the inward normal. The targets are
+    differentiable in the joints of the grasps. The forces, found by a search, are not
     differentiable in the contacts.
 
     Args:
@@ -185,8 +185,8 @@ def tip_compliance(
 ) -> Float[Tensor, "*b f"]:
     """Return the compliance [m/N] of each fingertip along its contact normal.
 
-    `jacobian` [m/rad] is that of the contact points by the h actuated joints, whose `stiffness`
-    [N m/rad] is given; `normals` are unit vectors.
+    `jacobian` [m/rad] is that of the contact points by the h actuated joints, whose `stiffness` [N
+    m/rad] is given. `normals` are unit vectors.
     """
     along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
     return (along**2 / stiffness).sum(-1)

@@ -49,7 +49,7 @@ class GripNumbers:
     forces: float = 8.0
     """Cut-off frequency [Hz] of the low-pass filter of the sensed forces."""
     carries: float = 0.8
-    """Share of the carried load that is commanded; with 1, the hand would press a rigid table with
+    """Share of the carried load that is commanded. With 1, the hand would press a rigid table with
     ever growing forces.
     """
     settled: float = 0.4
@@ -164,13 +164,13 @@ def held_forces(
 
 
 class GripHold:
-    """Hold controller that presses with the least forces that carry the sensed load and a push of
-    `PUSH` from any side.
+    """Hold controller that presses with the least forces against two loads. They are the sensed
+    load and a push of `PUSH` from any side.
 
-    Until the lifted load is steady, the forces also allow for the largest weight that an object of
-    this size may have. This reserve shrinks where torques or forces would exceed their limits; no
-    force exceeds `reference.max_force`. `status` becomes `TOO_HEAVY` when a fingertip slides
-    although the torques or forces have reached their limits.
+    Until the lifted load is steady, the forces allow for more. It is the largest weight that an
+    object of this size may have. This reserve shrinks where torques or forces would exceed their
+    limits; no force exceeds `reference.max_force`. `status` becomes `TOO_HEAVY` when a fingertip
+    slides although the torques or forces have reached their limits.
 
     Args:
         reference: the closing plan.
@@ -259,7 +259,7 @@ class GripHold:
         return push * min(1.0, GRIP.room * self.solver.most / max(largest, TINY))
 
     def _feel(self, observation: Observation, period: float) -> tuple[Balance, np.ndarray]:
-        """Filter the sensed forces, load and normals; return the grasp map of the contacts and the
+        """Filter the sensed forces, load and normals. Return the grasp map of the contacts and the
         reserve (f,) [N] of each finger.
         """
         normals = _sensed(observation, self.normals)

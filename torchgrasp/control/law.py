@@ -104,8 +104,8 @@ def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 def force_gain(
     covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"] | float
 ) -> Float[Tensor, "*b 3"]:
-    """Return the force gain [m/(s N)] on each axis: `alpha_f` [m N/s] over the axis's variance, Eq.
-    (28) of the paper.
+    """Return the force gain [m/(s N)] on each axis, Eq. (28) of the paper. It is `alpha_f` [m N/s]
+    over the axis's variance.
 
     `covariance` [N^2] is that of the contact force.
     """
@@ -140,8 +140,8 @@ def tip_velocity(
 ) -> Float[Tensor, "*b 3"]:
     """Return the commanded velocity [m/s] of each fingertip, the bracket in Eq. (25) of the paper.
 
-    It is (1 - lambda) K_P e_x + lambda C_F e_f for the errors e_x of position and e_f of force,
-    shortened to at most `MAX_SPEED`.
+    It is (1 - lambda) K_P e_x + lambda C_F e_f, shortened to at most `MAX_SPEED`. e_x and e_f are
+    the errors of position and of force.
 
     Args:
         position_error: e_x, from each fingertip to its contact [m].

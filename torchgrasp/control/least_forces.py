@@ -1,8 +1,8 @@
 """The least fingertip forces that carry a load, by a barrier method with a few Newton steps per
 tick.
 
-For normal forces n_i above floor_i, tangential forces t_i, joint torques tau_j, friction
-coefficient mu and a small weight eps of the barrier, the method minimises
+Let n_i be normal forces above floor_i, t_i tangential forces, tau_j joint torques, and mu the
+friction coefficient. With a small weight eps of the barrier, the method minimises
 
     sum n_i + penalty sum max(|tau_j| / effort_j - knee, 0)^2
         - eps sum [log(mu^2 (n_i - reserve_i)^2 - |t_i|^2) + log(n_i - floor_i)]
@@ -36,8 +36,8 @@ class BarrierNumbers:
     knee: float = 0.9
     """Share of their limits where the penalty begins."""
     gap: float = 0.01
-    """Weight of the barrier, as a share of the load and the floors [N]; larger: the forces stay
-    farther from the borders of the cones.
+    """Weight of the barrier, as a share of the load and the floors [N]. With a larger one the
+    forces stay farther from the borders of the cones.
     """
     growth: float = 0.02
     """Least multiple of the internal forces that is tried besides 0; each next one is twice it."""
@@ -74,10 +74,10 @@ class Balance(NamedTuple):
     """The grasp map of f contacts, with its pseudo-inverse and null space.
 
     `wrench` maps the n = 3 f components of the forces on the object to force and torque about the
-    contacts' centroid [m]: no unit in the first three lines, [m] in the others. The columns of
-    `inverse` are the least forces for each component of the wrench. The columns of `free` are an
-    orthonormal basis of the null space: k internal forces, which exert no wrench. The columns of
-    `wrench` are 0 for a finger in the air, so its force is free, too.
+    contacts' centroid [m]. It has no unit in the first three lines, and [m] in the others. The
+    columns of `inverse` are the least forces for each component of the wrench. The columns of
+    `free` are an orthonormal basis of the null space: k internal forces, which exert no wrench. The
+    columns of `wrench` are 0 for a finger in the air, so its force is free, too.
     """
 
     wrench: Float[Array, "6 n"]
@@ -146,7 +146,7 @@ class LeastForces:
 
         If no forces satisfy the constraints, the friction coefficient is raised to the least with
         which forces were found. The coefficient is also at least 1.25 times the one that the
-        internal forces `start` need: below it the forces would grow huge.
+        internal forces `start` need. Below it the forces would grow huge.
 
         Args:
             contacts: the grasp map.

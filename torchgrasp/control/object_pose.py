@@ -63,8 +63,8 @@ class LocalizationNumbers:
     worst: float = 20.0
     """Largest cost of one fingertip, so that a wrong touch does not decide."""
     older: float = 4.0
-    """Growth of the variance of a touch with each later touch, as a multiple of its own variance:
-    a touch moves the object by twice the surface's deviation.
+    """Growth of the variance of a touch with each later touch, as a multiple of its own variance. A
+    touch moves the object by twice the surface's deviation.
     """
     empty: float = 80.0
     """Cost of a pose at which the hand would have touched the object, if it touched nothing."""
@@ -78,10 +78,11 @@ class ContactPlanes:
     """Estimator of the object's displacement while the fingers close, from the tangent planes at
     its contacts.
 
-    A fingertip that touches measures how far its contact's plane has moved along the normal, with
-    the variance of the shape. A fingertip beyond its plane that touches nothing bounds this
-    distance. The estimate is the most probable displacement under a Gaussian prior with the mean
-    `expected` (6,) [m, rad], in the planned hand's frame; None means a mean of 0.
+    A fingertip that touches measures how far its contact's plane has moved along the normal. The
+    measurement has the variance of the shape. A fingertip beyond its plane that touches nothing
+    bounds this distance. The estimate is the most probable displacement under a Gaussian prior, in
+    the planned hand's frame. The prior has the mean `expected` (6,) [m, rad]; None means a mean of
+    0.
     """
 
     def __init__(
@@ -176,7 +177,7 @@ class Touches:
         self.nothing = not len(self.links)
 
     def add(self, observation: Observation, palm: Float[Tensor, "3"]) -> None:
-        """Add one observation to the averages; `palm` (3,) [m] is the palm's displacement from its
+        """Add one observation to the averages. `palm` (3,) [m] is the palm's displacement from its
         planned pose, in the planned hand's frame.
         """
         sensed = observation.tactile

@@ -87,8 +87,8 @@ class Settled:
 
         It is settled if all fingers touch. With `pressing`, each must also have a `share` of force
         control of at least 0.5, and a steady force. A force is steady if its average
-        (`TactileState.average`) is within `NOISE` [N] of that at the last tick that was not
-        settled. `touching` marks the fingers that touch.
+        (`TactileState.average`) changed by at most `NOISE` [N]. The change counts from the last
+        tick that was not settled. `touching` marks the fingers that touch.
         """
         average = observation.tactile.average
         settled = bool(touching.all())

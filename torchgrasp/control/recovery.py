@@ -1,6 +1,6 @@
 """Recovery when the object is not where the camera placed it.
 
-An approach stops at a touch, a hand that is about to fail reopens and closes again, and a lift is
+An approach stops at a touch, and a hand that is about to fail reopens and closes again. A lift is
 watched. Approach and reopening locate the object from touches (`Localization`) and move the palm to
 it. Vectors are in the frame of the planned hand; a displacement of the palm is relative to its
 planned pose.

@@ -213,8 +213,8 @@ class ClosingReference(Value):
         of the table.
 
         This cached property is in the frame of the planned hand. It is 0 without a table, and if no
-        link is in the table. It is also 0 for a hand that would have to rise by more than 30 mm
-        (`MOTION.most`), as in `ik.opened_pose`.
+        link is in the table. It is also 0 for a hand that would have to rise by more than 30 mm, as
+        in `ik.opened_pose`. `MOTION.most` is this height.
         """
         planned = torch.eye(4, dtype=torch.float64)[None]
         return opened_pose(self.hand, self.pregrasp[None], planned, self.table)[0, :3, 3]
@@ -248,9 +248,9 @@ class ClosingReference(Value):
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
         """Return the points (f, 3) [m] where fingertips would touch the object first.
 
-        They are `tips` - r n, with the radius r of each fingertip and the outward normal n of its
-        planned contact (`normals`). `tips` (f, 3) [m] are the centres of the fingertips, in the
-        frame of the planned hand.
+        They are `tips` - r n, with the radius r of each fingertip and its outward normal n. This is
+        the normal of its planned contact (`normals`). `tips` (f, 3) [m] are the centres of the
+        fingertips, in the frame of the planned hand.
         """
         return tips - self.hand.tips.radius[:, None] * self.normals
 

@@ -1,4 +1,4 @@
-"""The tries of a robot at one object: where a lift fails, the hand opens and withdraws, and another
+"""The tries of a robot at one object. Where a lift fails, the hand opens and withdraws, and another
 grasp comes next.
 """
 
@@ -112,7 +112,7 @@ class GraspTry:
         grasps: the grasps in the order of preference.
         start: function that returns the `GraspController` of a single grasp.
         surface: estimated surface of the object (`surface_field`) in the frame of the grasps, by
-            which the next grasp is chosen; None if it is unknown.
+            which the next grasp is chosen. None if it is unknown.
         tried: indices of the grasps that were tried. The last one is the grasp of this try.
         moved: motion (4, 4) [m] of the object since the grasps were planned; None means no motion.
 
@@ -121,7 +121,7 @@ class GraspTry:
         controller: the controller of this grasp.
         moved: motion (4, 4) [m] of the object since the grasps were planned, as far as it is known.
             It is a rigid transform in the frame of the grasps. The `controller` works in a frame
-            that moves with the object: transform a cloud for `relook` by the inverse of `moved`.
+            that moves with the object. Transform a cloud for `relook` by the inverse of `moved`.
 
     Raises `BadArgument` if `tried` is empty, or an index in it is none of the grasps.
     """
@@ -211,8 +211,8 @@ class GraspTry:
         """Return the next try, at the object where it is now expected; None if no grasp is left.
 
         Its grasp is the one of `others` that most likely holds, given that the tried grasps failed.
-        It is the first of `others` without a `surface`, and for grasps that were planned without a
-        table or not ranked by success.
+        In three cases it is the first of `others`. There is no `surface`, or the grasps were
+        planned without a table or not ranked by success.
 
         The `grasps` of the next try have in `meta` what this try has shown, as texts of a
         `Distribution`. `meta["friction"]` is `controller.friction`, if the grasps were planned for

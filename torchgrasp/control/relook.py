@@ -47,11 +47,11 @@ RELOOK = RelookNumbers()
 def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> Float[Tensor, "4 4"]:
     """Return the motion of an object along its table since its surface was estimated.
 
-    It is a rigid transform [m] of old to new points in the frame of the arguments: a shift along
-    the table and a rotation about its normal. The motion minimises the sum of log(1 + (d_i / s)^2).
-    Here d_i are the signed distances of the new points from the moved surface, and s = 4 mm. This
-    is Cauchy's cost, which outliers hardly change. A grid search to 80 mm and 30 degrees starts
-    Gauss-Newton steps.
+    It is a rigid transform [m] of old to new points in the frame of the arguments. It is a shift
+    along the table and a rotation about its normal. The motion minimises the sum of log(1 + (d_i /
+    s)^2). Here d_i are the signed distances of the new points from the moved surface, and s = 4 mm.
+    This is Cauchy's cost, which outliers hardly change. A grid search to 80 mm and 30 degrees
+    starts Gauss-Newton steps.
 
     Args:
         surface: the estimated surface (`surface_field`).

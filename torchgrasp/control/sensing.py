@@ -2,7 +2,7 @@
 sensors with delay, noise and failures.
 
 A robot with such sensors makes its `TactileState` with `feel_flags` or `feel_torques` instead of
-`measure`. f counts fingertips, and j all joints of the URDF.
+`measure`. Here f counts fingertips, and j all joints of the URDF.
 """
 
 import dataclasses
@@ -132,7 +132,7 @@ class DriveFeel:
     force (f,) [N] of each fingertip.
 
     A blocked joint does not reach its target. A drive of stiffness k and damping d exerts the
-    torque k (target - q) - d dq/dt at the joint angle q.
+    torque k (target - q) - d dq/dt. Here q is the joint angle.
     """
 
     def __init__(self, reference: ClosingReference) -> None:

@@ -209,8 +209,8 @@ def flag(
     """Return a mask (*b, f) of the fingertips that touch, with hysteresis.
 
     A fingertip that touched `before` touches while its low-passed normal force `average` [N] is
-    above `TOUCH_ON` / 2 times `factor`; another one touches above `TOUCH_ON` times `factor`. The
-    `factor` (no unit) is greater for noisier sensors.
+    above `TOUCH_ON` / 2 times `factor`. Another fingertip touches above `TOUCH_ON` times `factor`.
+    The `factor` (no unit) is greater for noisier sensors.
     """
     return torch.where(before, average > 0.5 * TOUCH_ON * factor, average > TOUCH_ON * factor)
 

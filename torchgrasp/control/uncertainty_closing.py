@@ -1,5 +1,5 @@
-"""The default closing: a control law like the paper's, extended for an object that is not where the
-camera placed it.
+"""The default closing: a control law like the paper's. It is extended for an object that is not
+where the camera placed it.
 """
 
 import dataclasses
@@ -220,7 +220,7 @@ class UncertaintyClosing:
         self, velocity: Float[Tensor, "f 3"], tips: Float[Tensor, "f 3"]
     ) -> Float[Tensor, "f 3"]:
         """Return the velocities [m/s] of the fingertips, limited so that none at `tips` (f, 3) [m]
-        enters the table; those of `low` ones slide along it.
+        enters the table. The `low` ones slide along it.
 
         A fingertip farther beyond the table's edge than above its plane keeps beyond the edge.
         """
@@ -318,7 +318,7 @@ def slide_along(
 ) -> Float[Tensor, "f 3"]:
     """Return the fingertips' `velocity` [m/s], changed so that the `low` ones stay at the table.
 
-    Their velocity along the table's unit normal `up` becomes `RIM.rate` (`RIM.gap` - h), which
+    Their velocity along the table's unit normal `up` becomes `RIM.rate` (`RIM.gap` - h). This
     brings them to the height `RIM.gap` and keeps them there. Here h is `height` [m], that of each
     fingertip's lowest point over the table. `low` is a mask of the fingertips that slide.
     """

@@ -1,5 +1,5 @@
-"""What public functions take in place of a cloud, a scene or a hand: arrays, clouds of other
-programs, files, names.
+"""What public functions take in place of a cloud, a scene or a hand. It may be arrays, clouds of
+other programs, files, or names.
 
 The decorator `checked` converts it to a value, so that all other functions take values alone.
 """
@@ -67,9 +67,9 @@ def _named(read: Callable[[Any], Read]) -> Callable[[Any, str], Read]:
 def as_cloud(value: Any) -> PointCloud:
     """Return a `PointCloud` [m], in its own frame, given any value that `CloudLike` names.
 
-    The value may be a cloud, a `GraspObject`, a file, an array or tensor (n, 3) [m], or a cloud of
-    Open3D or trimesh. The name of a shipped object means its view. An array has no viewpoint.
-    Raises `BadArgument` for anything else.
+    The value may be a cloud, a `GraspObject`, a file, or an array or tensor (n, 3) [m]. It may also
+    be a cloud of Open3D or trimesh. The name of a shipped object means its view. An array has no
+    viewpoint. Raises `BadArgument` for anything else.
     """
     if isinstance(value, PointCloud):
         return value

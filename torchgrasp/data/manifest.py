@@ -5,8 +5,8 @@
 apply the object's "suggested_scale" (default 1), which makes it graspable. Optional are "mass_kg",
 the "family" of similar objects, and the "group", such as "solid".
 
-A folder from a stranger may hold anything. A name of an object or a view is one part of a path, and
-no file outside the folder is read.
+A folder from a stranger may hold anything. A name of an object or a view is one part of a path. No
+file outside the folder is read.
 """
 
 import dataclasses
@@ -135,7 +135,7 @@ def write_objects(
 ) -> list[str]:
     """Make a folder of objects from a folder of mesh files; return the names of the objects.
 
-    Each object is named after its file, without the suffix. Each mesh is translated: its lowest
+    Each object is named after its file, without the suffix. Each mesh is translated. Its lowest
     point is then at z = 0, and the centre of its bounding box above the origin. Each view is a
     noisy cloud of at most 1000 points, rendered from a random direction above (`partial_view`). The
     manifest, `manifest.json`, names all objects and views. It is written last, so a folder with a
@@ -222,8 +222,8 @@ def _meet(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def _check_name(field: Field, name: str) -> None:
-    """Raise the field's error for a name that is more than one part of a path, or that is not
-    printable.
+    """Raise the field's error for a name that is more than one part of a path. Raise it also for
+    one that is not printable.
     """
     plain = name.isprintable() and not set(name) & set("/\\:") and name == name.strip(" .")
     if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= NAME_BYTES:

@@ -132,8 +132,8 @@ def _view_columns(data: GraspShards, jobs: range) -> dict[str, Any]:
 
 
 def _describe(field: Any) -> dict[str, str]:
-    """Return name, kind and shape of a column; -1 in the shape is a length that differs from row to
-    row.
+    """Return name, kind and shape of a column. A length that differs from row to row is -1 in the
+    shape.
     """
     kind = field.type
     shape = list[str]()

@@ -19,9 +19,9 @@ DECIMALS = 9  # decimals to which the offset [m] of a table is rounded
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
     """Return the pose [m] of the simulator's frame in the frame of the grasp.
 
-    The table is at z = 0, the hand above the origin. The x axis is along the hand's x axis, or
-    along the hand's y axis if the former is steeper than 60 degrees. `obj_from_hand` is the hand's
-    pose [m] in the frame of the grasp.
+    The table is at z = 0, the hand above the origin. The x axis is along the hand's x axis. If that
+    is steeper than 60 degrees, it is along the hand's y axis. `obj_from_hand` is the hand's pose
+    [m] in the frame of the grasp.
     """
     z = unit(table.normal.double())
     origin = obj_from_hand[:3, 3]

@@ -1,8 +1,8 @@
 """The golden set: shipped grasps with known verdicts, to check that an installed simulator works.
 
 `scripts/train.py golden` makes the grasps. In two cases the hand is displaced by 60 mm, so that the
-fingers miss the object. Two heavy objects weigh a little less and more than the 0.65 kg that
-fingers can carry by friction with 4 N.
+fingers miss the object. One heavy object weighs a little less, another a little more than 0.65 kg.
+Fingers can carry this by friction with 4 N.
 """
 
 from collections.abc import Iterator

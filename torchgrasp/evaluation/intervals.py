@@ -75,7 +75,7 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
     """Return the success rate over all trials, with its 95 % interval from resampling the units.
 
     If all trials passed, or none, resampling gives no width. The interval is then the one-sided 95
-    % bound of n independent trials, n being the number of units: its lower end is 0.05 ** (1 / n).
+    % bound of n independent trials, n being the number of units. Its lower end is 0.05 ** (1 / n).
     `seed` draws the resamples.
     """
     found = contrast_over([counts], [1.0], seed)
@@ -114,8 +114,8 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
 
 
 def _combine(sums: Float[Tensor, "*r c 2"], weights: Sequence[float]) -> Float[Tensor, "*r"]:
-    """Return the weighted sum of c success rates, given passed and all trials of each; NaN if a
-    rate has no trial.
+    """Return the weighted sum of c success rates, given passed and all trials of each. It is NaN if
+    a rate has no trial.
     """
     return (sums[..., 0] / sums[..., 1]) @ sums.new_tensor(weights)
 

@@ -69,8 +69,8 @@ class PullSpec(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
-    """The settings of the simulated trials that test a grasp: pulls at a floating object, or a lift
-    off a table.
+    """The settings of the simulated trials that test a grasp. Trials are pulls at a floating
+    object, or a lift off a table.
 
     `PROTOCOLS` holds ready protocols by name, such as "tabletop" and "dexgraspbench".
 
@@ -199,9 +199,9 @@ PROTOCOLS = {
   robot.
 * tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
 * household: the same at friction 0.8.
-* table-lift: a lift by 0.2 m of 0.249 kg with friction 0.8 at the fingertips and 0.2 at the table,
-  as published for single-view policies. One of three grasps must have raised the object by 0.1 m at
-  the end; `noise` and `push` displace and push it.
+* table-lift: a lift by 0.2 m of 0.249 kg, as published for single-view policies. The friction is
+  0.8 at the fingertips and 0.2 at the table. One of three grasps must have raised the object by 0.1
+  m at the end. `noise` and `push` displace and push it.
 """
 
 

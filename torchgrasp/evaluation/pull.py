@@ -59,9 +59,9 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     hand.
 
     The pulls are along -x, +x, -y, +y, -z and +z of the grasp's frame, until one fails. With a
-    `truth.table` the axes are those of a frame on this table: z up, x along the hand's x axis.
-    Every pull starts from the same closed grasp. The object's motion counts from the start of the
-    trial, so it includes the closing.
+    `truth.table` the axes are those of a frame on this table. There z is up, and x along the hand's
+    x axis. Every pull starts from the same closed grasp. The object's motion counts from the start
+    of the trial, so it includes the closing.
 
     Args:
         trial: the hand, a single grasp and the true object.

@@ -57,8 +57,9 @@ class ProtocolResult(Value):
             `deepest_mm` and `touch` are those of the first grasp, all other numbers those of the
             last.
         cause: why a lift did not hold the object: "start overlap", "toppled", "pushed away",
-            "ejected", "shape off", "never met", "too weak", "dropped when pushed", "turned" or
-            "slid". It is "" if the object was held, if the simulation diverged, or in pulls.
+            "ejected", "shape off", or "never met". Or it is "too weak", "dropped when pushed",
+            "turned" or "slid". It is "" if the object was held, if the simulation diverged, or in
+            pulls.
         size: size of the cause. It is an angle [deg] for "toppled" and "turned", and a force [N]
             for "too weak" and "dropped when pushed". For others it is a distance [mm].
         gap_mm: largest gap [mm] between a fingertip and the object at the planned posture. It is

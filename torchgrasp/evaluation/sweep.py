@@ -44,7 +44,7 @@ def evaluate(
     folder: Path | None = None,
     workers: Annotated[int, Range(0, 1024)] = 0,
 ) -> Generator[ViewScore, None, None]:
-    """Plan grasps on every view of a folder of objects, and try them in simulation; yield a score
+    """Plan grasps on every view of a folder of objects, and try them in simulation. Yield a score
     for each view.
 
     The planner sees only the clouds; only the simulator uses the true meshes. An object with bad
@@ -134,8 +134,8 @@ def _evaluate(
 
 
 def _plan(view: ObjectView, shelf: Path, protocol: Protocol, spec: EvaluationSpec) -> ViewScore:
-    """Plan grasps on a view and save them in the folder `shelf`, or count the grasps that an
-    earlier call saved.
+    """Plan grasps on a view and save them in the folder `shelf`. If an earlier call saved them,
+    count them instead.
     """
     found = plan_view(view, protocol, spec, view.file(shelf) if spec.planned else None)
     if found.grasps is not None and not spec.planned:

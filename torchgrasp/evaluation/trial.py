@@ -81,7 +81,7 @@ class Truth:
         neighbours: other bodies on the table, which the hand may push.
         slide: displacement (3,) [m] of the object along the table, halfway through the approach.
             None means no displacement; without an approach there is none, too.
-        camera: pose (4, 4) [m] of a depth camera (x right, y down, z forward) with which the robot
+        camera: pose (4, 4) [m] of a depth camera (x right, y down, z forward). With it the robot
             looks again before the approach. None means no second look.
     """
 
@@ -419,8 +419,8 @@ class TrialRun:
         return math.nan, math.nan
 
     def strained(self) -> bool:
-        """Return whether a joint's drive needs at least its greatest torque to reach its target
-        or, in the mode "grip", to grip.
+        """Return whether a joint's drive needs at least its greatest torque to reach its target. In
+        the mode "grip" it needs this torque to grip.
         """
         reference = self.robot.reference
         hold = self.controller.hold

@@ -61,7 +61,7 @@ def true_body(
     """Return a mesh as a body in the simulator's frame, with its convex parts and its mass [kg].
 
     A `mass` of None means that `spec` gives it. `obj_from_world` [m] is the pose of the simulator's
-    frame in the frame of the mesh; None means that both frames are the same.
+    frame in the frame of the mesh. None means that both frames are the same.
     """
     mesh, parts = read_solid(mesh, parts)
     density = spec.density

@@ -277,8 +277,8 @@ def try_grasp(
 
 
 def _draw_truth(view: ObjectView, grasp: Grasps, protocol: Protocol, seed: int) -> Truth:
-    """Return the true world of a trial: the object with a random pose error, and the camera of a
-    second look.
+    """Return the true world of a trial. It has the object with a random pose error, and the camera
+    of a second look.
     """
     mesh, parts = _read_solid(view.objects, view.object)
     error = None

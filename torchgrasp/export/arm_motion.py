@@ -60,8 +60,8 @@ def plan_motion(
         force: normal force [N] of the strongest finger at the "squeeze".
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
 
-    Raises `BadArgument` for grasps that were planned without this arm or with it at another place,
-    and for joints of another hand.
+    Raises `BadArgument` for grasps that were planned without this arm or with it at another place.
+    Raises it also for joints of another hand.
 
     >>> grasps = plan_grasps(cloud, hand, spec, arm=arm)  # doctest: +SKIP
     >>> motion = plan_motion(arm, hand, grasps[:1])  # doctest: +SKIP

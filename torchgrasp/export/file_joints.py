@@ -58,7 +58,8 @@ def read_order(hand: Hand, order: Sequence[str]) -> tuple[Column, ...]:
     JOINT:FACTOR:OFFSET.
 
     A word that starts with no joint of the hand is kept as its name. Raises `BadArgument` for an
-    actuated joint that is missing, a name twice, or a factor that is no number or 0.
+    actuated joint that is missing, or a name twice. Raises it also for a factor that is no number
+    or 0.
     """
     columns = list[Column]()
     for word in order:
@@ -219,7 +220,7 @@ def reach_tips(
     hand: Hand, joints: Float[Tensor, "g h"], tips: Float[Tensor, "g f 3"]
 ) -> tuple[Float[Tensor, "g h"], Float[Tensor, "g"]]:
     """Return joints [rad] within their limits that bring the pads to `tips` [m] in the palm's
-    frame, and the distance [m] that is left to the farthest.
+    frame. Return also the distance [m] that is left to the farthest tip.
 
     The search starts at `joints`.
     """

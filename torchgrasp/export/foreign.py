@@ -132,8 +132,8 @@ def read_foreign(
         quaternion: order of the four numbers after the position in a pose, "wxyz" or "xyzw". Files
             that name their numbers need none.
         unit_m: length [m] of one unit of the positions in the file.
-        root: the hand's frame whose poses the file has: a link of the hand's URDF, or the pose (4,
-            4) [m] of its root link in that frame. "" means the link that the file names
+        root: the hand's frame whose poses the file has. It is a link of the hand's URDF, or the
+            pose (4, 4) [m] of its root link in that frame. "" means the link that the file names
             (`root_link`, `base_link`, or the end of Isaac's `gripper_frame_link`). If it names
             none, "" means the hand's root link, or DexGraspBench's frame of the Allegro hand.
 
@@ -357,7 +357,7 @@ def _bench_tables(path: Path, width: int) -> dict[str, np.ndarray]:
 def _at_rest(
     hand: Hand, joints: Float[Tensor, "g h"], wrist: Float[Tensor, "g 4 4"]
 ) -> Float[Tensor, "g h"]:
-    """Return joints [rad] of opened hands at the grasp's pose whose fingertips are where `joints`
+    """Return joints [rad] of opened hands at the grasp's pose. Their fingertips are where `joints`
     have them at the pose `wrist` [m] in the grasp's frame of the hand.
 
     Where fingers do not reach, they come as near as they can, and a warning says so.
@@ -423,8 +423,8 @@ def _tell_turned_objects(numbers: np.ndarray, quaternion: Quaternion) -> None:
 
 
 def _tell_scattered_hands(numbers: np.ndarray, quaternion: Quaternion) -> None:
-    """Warn of hands' poses (g, 7) about an object at the origin, if the object is on one side of the
-    hand in the other order of quaternions alone.
+    """Warn if hands' poses (g, 7) seem to have another order of quaternions. In it alone the
+    object, which is at the origin, is on one side of the hand.
     """
     if len(numbers) < ORDER.grasps or _one_side(numbers, quaternion) >= ORDER.any_side:
         return

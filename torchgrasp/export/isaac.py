@@ -86,7 +86,7 @@ def format_isaac(
         object_id: name of the object's frame, such as its path in the stage.
         actuated: whether to leave out coupled joints, which follow others.
         gripper_link: name of the gripper's frame, or its path in the stage. Without a `flange`, its
-            last part names the link of the URDF whose poses are written; an unknown name means the
+            last part names the link of the URDF whose poses are written. An unknown name means the
             root link. With a `flange`, it only names the flange. None means the root link, or
             "flange".
         isaac_ros: whether to write the frames under the keys of Isaac ROS, `object_frame` and
@@ -149,8 +149,8 @@ def format_isaac(
 
 
 def _root_from_link(hand: Hand, grasps: Grasps, link: str) -> Float[Tensor, "*g 4 4"]:
-    """Return the pose [m] of a link in the root link's frame at each grasp; the identity for a name
-    that is none of the hand's links.
+    """Return the pose [m] of a link in the root link's frame at each grasp. It is the identity for
+    a name that is none of the hand's links.
     """
     if link not in hand.tree.link_names:
         return torch.eye(4, dtype=torch.float64)
@@ -175,9 +175,9 @@ def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -
     `far`.
 
     A `GraspFileWarning` names keys that are not read. It tells if neither the first line nor the
-    gripper's path names a hand: one of the other side may have the same joints. Raises the error of
-    `refuse` for a malformed file, another version, our own file of another hand, a joint that the
-    hand does not have, and an actuated joint that is missing.
+    gripper's path names a hand. A hand of the other side may have the same joints. Raises the error
+    of `refuse` for a malformed file, another version, or our own file of another hand. Raises it
+    also for a joint that the hand does not have, and for an actuated joint that is missing.
     """
     data = read_bounded(path, JSON_BYTES, ALLOWED, refuse)
     content = _read_yaml(path, data, refuse).entries("format", "format_version", "grasps")

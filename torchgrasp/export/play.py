@@ -1,5 +1,5 @@
-"""Folders that play grasps in a simulator: models of hand, object and table, the motion as data,
-and a short script.
+"""Folders that play grasps in a simulator. Each has models of hand, object and table, the motion as
+data, and a short script.
 """
 
 import dataclasses
@@ -97,9 +97,9 @@ def save_play(
 
     `python play.py 0` in the folder plays the first grasp. The script needs only the simulator and
     NumPy. The hand moves along its approach, closes without sensors, presses, lifts and holds. Then
-    a line of JSON says how far the object rose [m], and whether this is at least half of the lift.
-    `play.json` has the motion, the drives, the contacts and the object; its text "frames" explains
-    the numbers.
+    a line of JSON says how far the object rose [m]. It also says whether this is at least half of
+    the lift. `play.json` has the motion, the drives, the contacts and the object; its text "frames"
+    explains the numbers.
 
     Args:
         hand: the hand.
@@ -241,8 +241,8 @@ def pressing_force(spec: TrialSpec, mass: Positive) -> float:
     """Return the normal force [N] of the strongest finger in play: `spec.force`, or by default what
     the object needs.
 
-    With the default, two opposite fingers hold the weight of a `mass` [kg] and a push of `PUSH`
-    with half of the friction. It is at most `spec.max_force`, or else `PLAY.force`.
+    With the default, two opposite fingers hold the weight of a `mass` [kg] and a push of `PUSH`.
+    They use half of the friction. It is at most `spec.max_force`, or else `PLAY.force`.
 
     >>> round(pressing_force(TrialSpec(friction=0.8), 0.25), 1)
     6.2
@@ -323,10 +323,10 @@ def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
 def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
     """Return the values with which the templates of USD files are filled, by name.
 
-    They are "parts", the convex parts of the object, and "links" and "joints", those of the hand
-    and of the mount that carries it. Each is a list with one entry for each part, link or joint.
-    All joints are at zero. Lengths are in metres, masses in kilograms. Raises `BadArgument` for
-    names of links or joints that USD does not allow.
+    They are "parts", the convex parts of the object, and "links" and "joints". The last two are of
+    the hand and of the mount that carries it. Each is a list with one entry for each part, link or
+    joint. All joints are at zero. Lengths are in metres, masses in kilograms. Raises `BadArgument`
+    for names of links or joints that USD does not allow.
     """
     urdf = scene.urdf
     moment = PLAY.inertia

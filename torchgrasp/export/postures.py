@@ -148,9 +148,9 @@ def named_postures(
     """Return the squeeze of g grasps, then the joint positions [rad] of each posture, by name, on
     the CPU.
 
-    The postures are "pregrasp", "grasp" and "squeeze"; each has the g positions of every joint of
-    the URDF, by the joint's name. `force` [N] is the normal force of the strongest finger. `kp`
-    [N m/rad] is the stiffness of every drive; None means the hand's.
+    The postures are "pregrasp", "grasp" and "squeeze". Each has the g positions of every joint of
+    the URDF, by the joint's name. `force` [N] is the normal force of the strongest finger. `kp` [N
+    m/rad] is the stiffness of every drive; None means the hand's.
     """
     hand = hand.to("cpu")
     grasps = grasps.to("cpu")
@@ -164,7 +164,7 @@ def named_postures(
 
 
 def stands_still(hand: Hand, grasps: Grasps) -> Bool[Tensor, "g"]:
-    """Return a mask of the grasps whose hand closes at one pose; the other hands go down while they
+    """Return a mask of the grasps whose hand closes at one pose. The other hands go down while they
     close (`opened_pose`).
     """
     opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)

@@ -34,8 +34,8 @@ name.
 
 
 class _Dumper(yaml.SafeDumper):
-    """A writer of YAML with nine decimals and no exponent in each number, because YAML 1.1 reads
-    1e-05 as a text.
+    """A writer of YAML with nine decimals and no exponent in each number. The reason is that YAML
+    1.1 reads 1e-05 as a text.
     """
 
     def ignore_aliases(self, data: Any) -> bool:
@@ -213,7 +213,7 @@ def _trajectories(
     pressing: bool,
 ) -> Iterator[dict[str, Any]]:
     """Yield for each grasp a trajectory_msgs/JointTrajectory, as a dictionary, with all joints of
-    the hand; with `actuated`, without those that follow others.
+    the hand. With `actuated`, joints that follow others are left out.
 
     `times` (3,) [s] are those of the pre-grasp, the grasp and the squeeze. If `pressing`, the last
     has the torques as effort.

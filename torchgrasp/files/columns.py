@@ -131,7 +131,7 @@ def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
     `data` is the content of the file. Without names there must be three or six columns, and the
     dictionary holds one array `columns` (n, 3) or (n, 6). A first line of one number counts the
     lines. In files with the `suffix` .xyzi or .pts an intensity may follow x, y and z, and then a
-    colour; in .xyzrgb a colour follows. Raises `Malformed` for other texts.
+    colour. In .xyzrgb a colour follows. Raises `Malformed` for other texts.
     """
     names, table = _read_text(data)
     rows, width = table.shape

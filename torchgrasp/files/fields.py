@@ -183,8 +183,8 @@ def load_tensors(
     """Return the tensors and the metadata of a safetensors file of a `kind`, each by name.
 
     The file must hold the tensors `names`, and may hold those in `optional`. Raises
-    `ModelFileError` for a missing or broken file, another kind or version, other tensors, and
-    numbers that are not finite or above `LARGEST_NUMBER`.
+    `ModelFileError` for a missing or broken file, another kind or version, and other tensors.
+    Raises it also for numbers that are not finite or above `LARGEST_NUMBER`.
     """
     allowed = names.union(optional)
     refuse = functools.partial(ModelFileError, "path")
@@ -220,7 +220,7 @@ def read_value(
     """Return a value of class `of`, and the metadata by name, from a safetensors file of a `kind`.
 
     The tensors of the file have the names of the fields of class `of`. `rest` gives the fields that
-    are no tensors; those left out keep their defaults. Raises the errors of `load_tensors`, and
+    are no tensors; those left out keep their defaults. Raises the errors of `load_tensors`. Raises
     `ModelFileError` for a tensor whose shape or dtype is not that of the field's annotation.
     """
     fields = _tensor_fields(of)

@@ -114,8 +114,8 @@ class Value:
         return tuple(getattr(self, f.name) for f in dataclasses.fields(self) if f.compare)  # pyright: ignore
 
     def __repr__(self) -> str:
-        """Return the fields as text of at most 12 lines: types and shapes of tensors, and the
-        numbers of small tensors.
+        """Return the fields as text of at most 12 lines. It has types and shapes of tensors, and
+        the numbers of small tensors.
         """
         fields = [f for f in dataclasses.fields(self) if f.repr]  # pyright: ignore[reportArgumentType]
         parts = [*self._about(), *(f"{f.name}={_short(getattr(self, f.name))}" for f in fields)]
@@ -174,8 +174,8 @@ def _is_nan(value: Any) -> bool:
 
 
 def _short(value: Any) -> str:
-    """Return a short text for one field's value: type and shape of a tensor, length of a long list,
-    or the value.
+    """Return a short text for one field's value. It is type and shape of a tensor, length of a long
+    list, or the value.
     """
     if isinstance(value, Tensor):
         if value.numel() <= 4 and value.device.type == "cpu":
@@ -294,8 +294,8 @@ def spread(value: float | Tensor, like: Tensor, own: int = 0) -> float | Tensor:
     """Return `value` with axes of size 1 added, so that it broadcasts with the tensor `like`.
 
     A number is returned as it is. A tensor holds one value for each index of the first axis of
-    `like`. Each of these values has `own` axes, which match the last axes of `like`: `value` (b, 3)
-    becomes (b, 1, 3) for `like` (b, n, 3) and `own` 1.
+    `like`. Each of these values has `own` axes, which match the last axes of `like`. For example,
+    `value` (b, 3) becomes (b, 1, 3) for `like` (b, n, 3) and `own` 1.
     """
     if not isinstance(value, Tensor) or not value.ndim:
         return value
@@ -334,7 +334,7 @@ def map_rows(
     """Return the results of a function of rows where torch.vmap maps over it, and their axes.
 
     It serves as `vmap` of a torch.autograd.Function. The rows of all mapped entries are computed
-    together. `size` is the number of entries, and `axes` are their axes in the `arguments`; None
+    together. `size` is the number of entries, and `axes` are their axes in the `arguments`. None
     means the same argument for all. In the results the axis is 0.
     """
     parts = [

@@ -186,8 +186,8 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
 
 
 class _Form(NamedTuple):
-    """What is read of an annotation once: its type with brackets or None, the types in the brackets,
-    and what kind of annotation it is.
+    """What is read of an annotation once. It is its type with brackets or None, the types in the
+    brackets, and what kind of annotation it is.
     """
 
     hint: Any
@@ -410,8 +410,8 @@ def _has_tensor(hint: Any) -> bool:
 
 @functools.cache
 def _always(kind: type) -> bool:
-    """Return whether a class of values is checked even if the library makes the value, as its
-    numbers may be bad.
+    """Return whether a class of values is checked even if the library makes the value. Its numbers
+    may be bad.
     """
     return hasattr(kind, "__post_init__") or not any(map(_has_tensor, _fields(kind).values()))
 

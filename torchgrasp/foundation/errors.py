@@ -34,8 +34,8 @@ class GraspError(Exception):
 class BadArgument(GraspError, ValueError):
     """An argument has a wrong shape, type or range.
 
-    `argument` is its name, `found` what was given, and `allowed` a text that says what is expected;
-    the message holds all three. For a misspelt word it names the nearest allowed one.
+    `argument` is its name, `found` what was given, and `allowed` a text that says what is expected.
+    The message holds all three. For a misspelt word it names the nearest allowed one.
     """
 
     def __init__(self, argument: str, found: object, allowed: str):

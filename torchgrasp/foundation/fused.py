@@ -1,9 +1,9 @@
-"""Compiled loops in the place of many small operations of torch, each of which takes a microsecond
+"""Compiled loops in the place of many small operations of torch. Each operation takes a microsecond
 or more however little it computes.
 
 The operations of torch stay the definition: loops compute the same to 1e-9, and only where no
-gradient is needed. They are off unless the environment has `TORCHGRASP_FUSED=1`. numba, of the
-extra `fast`, compiles each loop at its first use, and keeps the result on the disk.
+gradient is needed. They are off unless the environment has `TORCHGRASP_FUSED=1`. The extra `fast`
+brings numba, which compiles each loop at its first use, and keeps the result on the disk.
 """
 
 import functools
@@ -33,8 +33,8 @@ def has_numba() -> bool:
 
 
 def is_fused(*tensors: Tensor) -> bool:
-    """Return whether compiled loops are asked for and can compute with these tensors: float64 on
-    the CPU, which torch neither differentiates nor maps over.
+    """Return whether compiled loops are asked for and can compute with these tensors. They can with
+    float64 on the CPU, which torch neither differentiates nor maps over.
 
     Raises `MissingExtra` if they are asked for without numba.
     """

@@ -43,8 +43,8 @@ def run_tasks(
     order of the tasks.
 
     Each task runs on one thread of a separate process. A task that takes more than `limit` [s] of
-    the process's CPU time gives `Status.TIMED_OUT`: on a busy machine it ends at the same point.
-    One that takes ten times as long by the clock gives it, too, since it may wait for ever; on
+    the process's CPU time gives `Status.TIMED_OUT`. So on a busy machine it ends at the same point.
+    One that takes ten times as long by the clock gives it, too, since it may wait for ever. On
     Windows only this applies. A task whose process dies twice gives `Status.WORKER_DIED`. The error
     of a task is raised in place of its result. All workers end when the caller stops iterating.
     Raises `NoWorkers` if no process can start.
@@ -190,8 +190,8 @@ def _run_pool(
 def _usual_context() -> Any:
     """Return the way in which worker processes start.
 
-    They are copies of a server process that has imported the library, and has no threads that a
-    copy would lack. On Windows each imports the library itself.
+    They are copies of a server process that has imported the library. The server has no threads
+    that a copy would lack. On Windows each imports the library itself.
     """
     copies = "forkserver" in multiprocessing.get_all_start_methods()
     return multiprocessing.get_context("forkserver" if copies else "spawn")
@@ -271,7 +271,7 @@ def pack(value: Any, known: dict[int, Any] | None = None) -> Any:
     """Return a value in a form for another process; `unpack` restores it.
 
     NumPy arrays take the place of tensors, which processes would share. `known` maps the `id` of
-    each packed object to its packed form, so that an object that occurs twice is sent once.
+    each packed object to its packed form. So an object that occurs twice is sent once.
     """
     known = {} if known is None else known
     if id(value) in known:

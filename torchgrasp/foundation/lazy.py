@@ -1,4 +1,4 @@
-"""Modules that take long to import, or that few users need: each is imported when one of its names
+"""Modules that take long to import, or that few users need. Each is imported when one of its names
 is first used. `lazy_loader` would import the parents of submodules, such as SciPy, at once.
 """
 

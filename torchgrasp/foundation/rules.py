@@ -240,7 +240,8 @@ def is_known(value: Tensor) -> bool:
 def show(value: Any) -> str:
     """Return a short text that shows a wrong argument.
 
-    It is a number or text itself, the shape and dtype of a tensor, or else the name of the type.
+    It is a number or text itself, or the shape and dtype of a tensor. Else it is the name of the
+    type.
     """
     if isinstance(value, Tensor):
         return f"a tensor of shape {tuple(value.shape)} and {value.dtype}"
@@ -268,7 +269,7 @@ def nearest_rotation(turn: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], 
     """Return the rotation nearest to a matrix, and the error of the matrix as an angle [deg].
 
     The error is the largest distance between a column of the matrix and the same column of the
-    rotation, in degrees, as for small angles. It is infinite for numbers that are not finite.
+    rotation. It is in degrees, as for small angles. It is infinite for numbers that are not finite.
     """
     turn = turn.double()
     if not bool(torch.isfinite(turn).all()):

@@ -18,7 +18,7 @@ from torchgrasp.foundation.rules import is_known
 from torchgrasp.geometry.linalg import eye_like, norm, unit
 
 FLAT = 1e-3
-"""Least height of a contact triangle over its longest side: in a flatter one, noise decides the
+"""Least height of a contact triangle over its longest side. In a flatter one, noise decides the
 direction of the virtual frame.
 """
 

@@ -106,8 +106,8 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
 
 
 def with_true_normals(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
-    """Return a mesh whose face normals follow from its vertices: the mesh itself if its normals do,
-    else a bare copy.
+    """Return a mesh whose face normals follow from its vertices. This is the mesh itself if its
+    normals do, else a bare copy.
 
     trimesh before 5.2 keeps normals that were read before an uneven scaling. It casts rays by them,
     too. A file may bring wrong normals as well.
@@ -127,8 +127,8 @@ def closest_on_triangles(
     lies.
 
     The `points` (n, 3) and the corners of the `triangles` (n, 3 corners, 3) have the same unit. The
-    feature (n,) is 0 inside the face, 1 to 3 on the sides ab, bc, ca, and 4 to 6 at the corners a,
-    b, c.
+    feature (n,) is 0 inside the face. It is 1 to 3 on the sides ab, bc, ca, and 4 to 6 at the
+    corners a, b, c.
     """
     a = triangles[:, 0]
     u = triangles[:, 1] - triangles[:, 0]
@@ -174,7 +174,7 @@ def clip_mesh(
     ends: list[tuple[int, int]] = []
 
     def cross(a: int, b: int) -> int:
-        """Return the index of the new vertex on the edge between the vertices a and b, where the
+        """Return the index of the new vertex on the edge between the vertices a and b. There the
         field is 0.
         """
         key = (min(a, b), max(a, b))
@@ -235,8 +235,8 @@ def _quiet(log: logging.Logger) -> Iterator[None]:
 
 
 def _count_faces(data: bytes, suffix: str) -> int:
-    """Return the number of faces that a file declares, or 0 for a format in which the file's size
-    bounds the number.
+    """Return the number of faces that a file declares. Return 0 for a format in which the file's
+    size bounds the number.
     """
     if suffix == ".obj":
         return data.count(b"\nf")
@@ -248,7 +248,7 @@ def _count_faces(data: bytes, suffix: str) -> int:
 
 
 def _read_header(data: bytes) -> int:
-    """Return the number of faces in the header of a .ply file; the header is read as leniently as
+    """Return the number of faces in the header of a .ply file. The header is read as leniently as
     trimesh reads it.
     """
     properties = faces = 0

@@ -41,7 +41,7 @@ class Plane(Value):
     """The plane of a table: the points p [m] with normal . p = offset. The normal points up, to the
     objects.
 
-    A table with an `edge` ends there: it fills the points below its own plane and behind the plane
+    A table with an `edge` ends there. It fills the points below its own plane and behind the plane
     of the edge. Fingers may then reach under what lies over the edge.
 
     Args:
@@ -118,7 +118,8 @@ class Plane(Value):
         """Return lower bounds (*b,) [m] of the distances of points (*b, 3) [m] from the table.
 
         Without an edge they are the heights. With one they are the larger of the height and of the
-        distance beyond the edge: negative exactly inside the table. b stands for any batch axes.
+        distance beyond the edge. They are negative exactly inside the table. Here b stands for any
+        batch axes.
         """
         height = self.height(points)
         return height if self.edge is None else torch.maximum(height, self.edge.height(points))
@@ -194,8 +195,8 @@ def upright_frame(
     camera. If the camera is straight above, x points to the point farthest from the vertical
     through the points' centroid. The origin is on this vertical, on the table if there is one.
     `viewpoint` [m] is the camera's position, or several, whose mean is taken. Raises `BadArgument`
-    for a table above most points, above a camera, or more than 2 m (`MAX_EXTENT`) below the highest
-    point.
+    for a table above most points or above a camera. Raises it also for one more than 2 m
+    (`MAX_EXTENT`) below the highest point.
     """
     points = points.detach().cpu().double()
     centre = points.mean(0)

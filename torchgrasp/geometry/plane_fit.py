@@ -58,7 +58,7 @@ class PlaneNumbers:
     per_quantile: float = 3.14
     """Ratio of the standard deviation to this quantile, for normally distributed residuals."""
     tukey: float = 4.685
-    """Residual, over the scale, from which a point has no weight: with it, Tukey's fit of normally
+    """Residual, over the scale, from which a point has no weight. With it, Tukey's fit of normally
     distributed residuals has 95 % of the efficiency of least squares.
     """
     steps: int = 30
@@ -147,8 +147,8 @@ class PlaneFit:
         """Return the plane with its normal turned to the upper side.
 
         `view` holds all points of the view. If their upward direction is unknown, the normal points
-        to the camera; if that is unknown too, to the side on which most points are, weighted by
-        their heights up to `PLANES.reach`.
+        to the camera. If that is unknown too, it points to the side on which most points are. They
+        are weighted by their heights up to `PLANES.reach`.
         """
         if view.sky is not None:
             side = float(self.normal @ view.sky)
@@ -204,7 +204,7 @@ def _is_same(fit: PlaneFit, other: PlaneFit) -> bool:
 
 def _levels(view: SeenPoints, fit: PlaneFit) -> list[PlaneFit]:
     """Return the two parallel levels through which a fit goes aslant, as through the floors of a
-    room and of a bin in it; an empty list if it is one plane.
+    room and of a bin in it. Return an empty list if it is one plane.
     """
     if fit.scale < PLANES.mixed:
         return []
@@ -302,8 +302,8 @@ def _held(
     normals: Float[Tensor, "m 3"],
     offsets: Float[Tensor, "m"],
 ) -> Float[Tensor, "m n"]:
-    """Return a matrix of planes by points: 1 if the point is within twice its noise of the plane,
-    else 0.
+    """Return a matrix of planes by points. It is 1 if the point is within twice its noise of the
+    plane, else 0.
     """
     held = torch.empty(len(normals), len(points), dtype=torch.float32, device="cpu")
     parts = (x.split(PLANES.at_once) for x in (held, normals, offsets[:, None]))

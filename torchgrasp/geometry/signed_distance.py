@@ -73,7 +73,7 @@ class DistanceField(Value, abc.ABC):
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance (*b,) [m] at the grid node nearest to each point (*b, 3) [m].
 
-        For a point outside the grid this is a node at the border of the grid. b stands for any
+        For a point outside the grid this is a node at the border of the grid. Here b stands for any
         batch axes. `query` is slower, and interpolates.
         """
         grid = self._grid(points)
@@ -97,8 +97,8 @@ class DistanceField(Value, abc.ABC):
         """Return (distance, gradient) at points (*b, 3) [m], interpolated between the nodes.
 
         `distance` (*b,) is the signed distance [m], and `gradient` (*b, 3) its derivative by the
-        point (no unit). b stands for any batch axes. Outside the grid, the distance [m] from the
-        grid is added to the value at the border.
+        point (no unit). Here b stands for any batch axes. Outside the grid, the distance [m] from
+        the grid is added to the value at the border.
         """
         origin, spacing, last, (dx, dy), first, corners = self._grid(points)
         position = (points - origin) / spacing
@@ -171,7 +171,7 @@ class SignedDistanceField(DistanceField):
 
     @kept
     def _cells(self) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:
-        """The last node along each axis, and the steps from the first corner of a cell to all
+        """The last node along each axis. Also the steps from the first corner of a cell to all
         corners in `values`.
         """
         shape = torch.tensor(self.values.shape, device=self.values.device)

@@ -42,11 +42,11 @@ class SupportNumbers:
     """Factor on the score of a support that is flat in a small part only."""
     flat: float = 1.1
     """Greatest scale (ratio of measured to assumed noise) of a small part that is as flat as the
-    noise, and thus not bowed.
+    noise. Such a part is not bowed.
     """
     downward: float = 0.3
     """Least cosine between the normal and the image's downward direction of a plane that an upright
-    camera cannot see from above: a wall faces a camera that looks down so.
+    camera cannot see from above. A wall faces a camera that looks down so.
     """
     upside_down: float = 0.25
     """Factor on the score of such a plane: few cameras are upside down."""
@@ -85,7 +85,7 @@ class SupportNumbers:
     below: float = 0.2
     """Least ratio of points below to points above a support, in a column that goes through it."""
     most_pierced: float = 0.15
-    """Greatest share of the low points over a support that continue below it: between slats, some
+    """Greatest share of the low points over a support that continue below it. Between slats, some
     points of an object do.
     """
     least_standing: float = 0.001
@@ -103,7 +103,7 @@ class SupportNumbers:
     furniture: float = 0.3
     """Width [m] of a region from which it belongs to no object that a hand grasps."""
     small_table: float = 0.2
-    """Least width [m] of a bowed support that is parallel to a plane as wide as furniture: above a
+    """Least width [m] of a bowed support that is parallel to a plane as wide as furniture. Above a
     floor it is a small table.
     """
     parallel: float = 0.985
@@ -115,8 +115,8 @@ class SupportNumbers:
     closing: int = 2
     """Cells by which the groups of points grow and shrink again, to close gaps."""
     gap: float = 0.25
-    """Points below the plane that the camera sees in a cell of a gap, over the usual points of a
-    cell on it.
+    """Points below the plane that the camera sees in a cell of a gap. They are divided by the usual
+    points of a cell on it.
     """
     least_part: float = 0.02
     """Least size of a group of points, over the largest group."""
@@ -176,7 +176,7 @@ def bound(
         eye: position (3,) [m] of the camera; None if unknown.
 
     The region is the convex hull of the largest connected group of the points on the plane. Another
-    large group joins it if the camera sees almost nothing below the plane between the groups: then
+    large group joins it if the camera sees almost nothing below the plane between the groups. Then
     an object hides that area.
     """
     if int(on.sum()) < 3:
@@ -212,7 +212,7 @@ def _crossed(
     """Return a mask of the points in narrow columns in which a surface goes on below a plane.
 
     There the plane cuts a wall or a bed, or ends. `flat` holds the place of each point in the plane
-    [m], `height` is that above it [m], and the points `on` lie on it.
+    [m], and `height` is that above it [m]. The points `on` lie on it.
     """
     cells = number_rows(torch.floor(flat / SUPPORTS.pierced_cell).long())
     below = ~on & (height < 0) & (height > -SUPPORTS.low)
@@ -259,7 +259,7 @@ def _parts(
     """Yield the connected groups of points in a plane, the largest first, without narrow strips and
     specks.
 
-    `lower` are the places at which rays to points below the plane cross it: groups do not connect
+    `lower` are the places at which rays to points below the plane cross it. Groups do not connect
     where they fill the cells of a gap.
     """
     cells = torch.floor(flat / SUPPORTS.cell).long()
@@ -291,8 +291,8 @@ def cross(plane: Plane, points: Points, eye: Vector | None) -> tuple[Points, Boo
     behind it.
 
     `points` (n, 3) and the camera's position `eye` (3,) are in metres. Without a camera, `eye`
-    None, the points themselves are returned, and those more than `PLANES.reach` [m] below the plane
-    do not count as behind it.
+    None, the points themselves are returned. Then points more than `PLANES.reach` [m] below the
+    plane do not count as behind it.
     """
     height = plane.height(points)
     if eye is None:

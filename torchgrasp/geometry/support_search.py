@@ -67,7 +67,7 @@ def find_table(
         image_up: upward direction (3,) of the camera's image, as for `find_supports`.
 
     Raises `BadArgument` for a camera below the table, a table with an edge, or `up` far from the
-    table's normal; `NoSupport` if none is found.
+    table's normal. Raises `NoSupport` if none is found.
     """
     plane = as_plane(table)
     if plane is not None and plane.edge is not None:
@@ -120,8 +120,8 @@ def _find_under(
 def _support_near(
     target: Target, points: Points, eye: Vector, up: Vector | None
 ) -> list[SupportPlane]:
-    """Return the plane on which a target stands among the `points` [m] close to it, in a list; an
-    empty list without one.
+    """Return the plane on which a target stands among the `points` [m] close to it, in a list. The
+    list is empty without one.
 
     A bowed or soft support has such a plane, although no plane holds its whole surface.
     """
@@ -249,7 +249,7 @@ def _ordered(found: list[_Candidate]) -> list[_Candidate]:
 
 
 def _refit(view: SeenPoints, fit: PlaneFit) -> PlaneFit:
-    """Return a rough plane fitted again, to the largest group of points on it: without this, walls
+    """Return a rough plane fitted again, to the largest group of points on it. Without this, walls
     that a small or bowed support cuts turn its plane away.
     """
     height = view.points @ fit.normal - fit.offset
@@ -268,9 +268,9 @@ def _refit(view: SeenPoints, fit: PlaneFit) -> PlaneFit:
 class _FlatSurface:
     """A plane that was fitted to a view, the points on it, and its region.
 
-    `height` [m] is that of each point of the view, `tolerance` [m] the greatest height of a point
-    on the plane, above or below. `support` is None without a flat region; `bowed` tells that the plane
-    was fitted to a part of the points alone.
+    `height` [m] is that of each point of the view. `tolerance` [m] is the greatest height of a
+    point on the plane, above or below. `support` is None without a flat region. `bowed` tells that
+    the plane was fitted to a part of the points alone.
     """
 
     fit: PlaneFit

@@ -1,5 +1,5 @@
-"""What a hand can do, as numbers: spans and forces of its fingertips, widths that it can hold, and
-its free postures.
+"""What a hand can do, as numbers. They are spans and forces of its fingertips, widths that it can
+hold, and its free postures.
 
 All numbers come from seeded random postures, which are uniform within the limits of the joints. A
 posture is free if no pair of links of `[self_collision]` overlaps.
@@ -45,7 +45,7 @@ class FingerAbility:
         tip_link: name of the link of its tip.
         joints: number of the actuated joints that move the tip.
         force: greatest normal force [N] of the tip, the median over the free postures. NaN if in
-            half of them no joint moves the contact point along its normal: then the structure
+            half of them no joint moves the contact point along its normal. Then the structure
             carries the load.
         sure_force: normal force [N] that the tip reaches in 90 % of the free postures. NaN if in
             these no joint moves the contact point along its normal.
@@ -235,12 +235,12 @@ def _measure(hand: Hand, postures: int, seed: int) -> HandAbilities:
 def _fingers(hand: Hand, levers: Float[Tensor, "n f h"]) -> tuple[FingerAbility, ...]:
     """Return the abilities of the fingers.
 
-    `levers` [m, or no unit for a sliding joint] are the moves of each contact along its normal, for
-    each actuated joint.
+    `levers` [m, or no unit for a sliding joint] are for each contact and each actuated joint. They
+    are the moves of the contact along its normal.
     """
     effort = levers.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
     # the joint that reaches its effort first bounds the force; one without a lever does not, even
-    # if its effort is unknown, which is 0
+    # with effort 0 (unknown)
     bounds = torch.where(levers == 0, math.inf, effort / levers.abs())
     force = bounds.amin(2)  # (n, f)
     moved = (hand.tree.moves[hand.tips.index] @ hand.actuated.coupling.abs()) > 0  # (f, h)

@@ -1,7 +1,7 @@
 """Collision shapes of a hand's links: covering spheres, exact boxes, and the pairs of links that
 can collide.
 
-Spheres give the clearance from object and table: each collision shape is cut into cells, with one
+Spheres give the clearance from object and table. Each collision shape is cut into cells, with one
 sphere for each cell. No surface with a radius of curvature above 25 mm reaches a face between the
 spheres. Exact boxes and spheres are tested for self-collision; in this test a cylinder becomes a
 prism of twelve sides. A posture is one position of all joints.
@@ -219,8 +219,8 @@ def _parts(shape: LinkShape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple,
 def collision_pairs(
     urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0
 ) -> list[tuple[str, str]]:
-    """Return the names of the pairs of links that collide in some of n random postures, but not in
-    nearly all.
+    """Return the names of the pairs of links that collide in some of n random postures. Pairs that
+    collide in nearly all are left out.
 
     A link and its parent are no such pair. `coupling` gives the coupled joints by name. Raises
     `BadArgument` for a bad `n` or unknown joints, and `HandFileError` for too many shapes in one

@@ -216,7 +216,7 @@ class Fingertips(Value):
     @kept
     def cone(self) -> Float[Tensor, "f"]:
         """Half angle (f,) [rad] of the cone about each pad's normal in which the pad may touch a
-        surface; a cached property.
+        surface. A cached property.
         """
         # float32, as when results were published
         angles = self.radius.new_tensor([ROUND_PAD, FLAT_PAD], dtype=torch.float32)

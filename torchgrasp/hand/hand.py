@@ -79,9 +79,10 @@ class Hand(Value):
     always in the order of `finger_names`: finger i touches contact i of a grasp.
 
     In the methods, `joints` (*b, h) are positions of the h actuated joints, in the order of
-    `joint_names`. Their unit is [rad], or [m] for sliding joints. f counts the fingertips, j all
-    movable joints of the URDF, l its links, and s the collision spheres; *b stands for any batch
-    axes. Methods raise `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity.
+    `joint_names`. Their unit is [rad], or [m] for sliding joints. Here f counts the fingertips, j
+    all movable joints of the URDF, l its links, and s the collision spheres. `*b` stands for any
+    batch axes. Methods raise `BadArgument` for joints of a wrong count or dtype, and for NaN or
+    infinity.
 
     Attributes:
         name: name of the hand.

@@ -29,7 +29,7 @@ Frames = Float[Tensor, "3 4 l n"]  # poses (3 x 4) of l links in n postures
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicTree(Value):
-    """The forward kinematics of a URDF, as tables of l links and j movable joints; a `Hand` holds
+    """The forward kinematics of a URDF, as tables of l links and j movable joints. A `Hand` holds
     it as `tree`.
 
     The root link of a hand is its palm. `Fingertips.chains` holds only the part of the tree that
@@ -143,15 +143,15 @@ class FreeMotion(Value):
     """Tables of how the links of a free-floating hand, and marker points on them, move in a small
     step.
 
-    The q motions are three translations along the root's axes, three rotations about them, and the
-    joints that the actuated joints move. `moves[l, q]` is 1 if motion q moves link l. `coupling`
-    maps a step of d = 6 + h numbers, of pose and actuated joints, to the motions; None means the
-    identity.
+    The q motions are three translations along the root's axes, and three rotations about them. Then
+    come the joints that the actuated joints move. `moves[l, q]` is 1 if motion q moves link l.
+    `coupling` maps a step of d = 6 + h numbers, of pose and actuated joints, to the motions. None
+    means the identity.
 
-    `product` maps the frames of all links, as k = 4 l numbers for each coordinate, to all m markers
-    in one matrix product. The markers come in groups of `sizes`: first the given groups, then the
-    origins of all motions, all rotation axes, and all translation axes. One of the two axes of a
-    motion is zero.
+    `product` maps the frames of all links to all m markers in one matrix product. The frames are k
+    = 4 l numbers for each coordinate. The markers come in groups of `sizes`. First come the given
+    groups, then the origins of all motions, all rotation axes, and all translation axes. One of the
+    two axes of a motion is zero.
     """
 
     product: Float[Tensor, "m k"]
@@ -338,7 +338,7 @@ def pose_in_carrier(
 
 
 def _tables(chain: "pytorch_kinematics.chain.Chain", frame: int) -> Float[Tensor, "4 3 4"]:
-    """Return four 3 x 4 tables: a frame's pose in its parent is their sum, weighted by 1, sin q,
+    """Return four 3 x 4 tables. A frame's pose in its parent is their sum, weighted by 1, sin q,
     cos q and q.
     """
     offset = chain.joint_offsets[frame]

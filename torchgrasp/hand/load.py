@@ -45,9 +45,8 @@ def find_hand(name_or_path: str | Path) -> Path:
     Args:
         name_or_path: name of a shipped hand, a folder with a hand.toml, or the path of a hand.toml.
 
-    Raises `HandFileError` if there is no such hand. It is also raised for a shipped hand's name if
-    another folder of this name with a hand.toml is in the working directory. "./NAME" means that
-    folder.
+    Raises `HandFileError` if there is no such hand. It is also raised if a folder in the working
+    directory has a shipped hand's name and a hand.toml. "./NAME" means that folder.
 
     >>> find_hand("allegro").name
     'allegro'
@@ -79,8 +78,8 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
         name_or_path: name of a shipped hand, such as "allegro", "barrett", "leap" or "shadow". Or
             the folder or hand.toml of another hand.
         fingers: the grasping fingers, in one of these forms:
-            - the name of an option of hand.toml, which lists fingers: "default", or for the Allegro
-              hand "four" (all) or "paper_literal" (index, middle and ring);
+            - the name of an option of hand.toml, which lists fingers: "default". For the Allegro
+              hand also "four" (all) or "paper_literal" (index, middle and ring);
             - a number of fingers, for the first option with this number;
             - a tuple of the names of three to five fingers, or a text with commas:
               "index,middle,thumb".

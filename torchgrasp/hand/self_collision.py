@@ -1,8 +1,8 @@
 """Exact signed separations between the links of a hand, whose shapes are boxes and spheres.
 
 s counts shapes, p pairs of shapes, n postures, and k chosen combinations of pair and posture.
-`Frames` (3, 4, l, n) are the poses (3 x 4) [m] of l links in n postures, in any one frame, in which
-positions [m] then are, too.
+`Frames` (3, 4, l, n) are the poses (3 x 4) [m] of l links in n postures, in any one frame.
+Positions [m] are then in this frame, too.
 """
 
 import dataclasses
@@ -139,9 +139,9 @@ class SelfCollision(Value):
 
         * `separations` (p, n) [m] are those of the method `separations`.
         * `index` (p, n) is the column in `wrenches` of each pair in each posture.
-        * `wrenches` (6, k) are derivatives of a separation by a twist of the pair's second shape:
-          three by its translation, then three [m/rad] by its rotation about the origin. Axes and
-          origin are those of the frame of `frames`.
+        * `wrenches` (6, k) are derivatives of a separation by a twist of the pair's second shape.
+          Three are by its translation, then three [m/rad] by its rotation about the origin. Axes
+          and origin are those of the frame of `frames`.
 
         The wrench of a pair that is at least `below` apart is zero.
 
@@ -299,8 +299,8 @@ class SelfCollision(Value):
     ) -> tuple[
         tuple[Tensor, Tensor], tuple[Tensor, Tensor], Float[Tensor, "3 k"], Float[Tensor, "3 k"]
     ]:
-        """Return for chosen pairs: two shape indices, two axes, the centre [m] of the second shape,
-        and the vector between the centres [m].
+        """Return numbers of chosen pairs. They are two shape indices, two axes, the centre [m] of
+        the second shape, and the vector between the centres [m].
         """
         rotation = shapes[0].flatten(2)
         center = shapes[1].flatten(1)
@@ -349,7 +349,7 @@ class BoxPairs(NamedTuple):
         1996).
 
         The three axes of box a come first, then those of b, then the nine cross products. The
-        largest separation is a lower bound of the distance; a negative one is minus the shortest
+        largest separation is a lower bound of the distance. A negative one is minus the shortest
         translation that separates the boxes.
         """
         a, b, gap, half_a, half_b = self

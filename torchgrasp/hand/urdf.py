@@ -86,8 +86,8 @@ class LinkShape:
 class Link:
     """A rigid link of a URDF.
 
-    `com` [m] is the centre of `mass` [kg] in the link's frame, and `inertia` [kg m^2] holds xx, xy,
-    xz, yy, yz, zz about it, along the link's axes. `shapes` are the collision shapes.
+    `com` [m] is the centre of `mass` [kg] in the link's frame. `inertia` [kg m^2] holds xx, xy, xz,
+    yy, yz, zz about it, along the link's axes. `shapes` are the collision shapes.
     """
 
     name: str
@@ -103,7 +103,7 @@ class Joint:
     "continuous" or "fixed".
 
     The joint's frame is at `xyz` [m] in the parent's frame, turned by `rpy` [rad] about the fixed
-    axes x, y, z; `axis` is its unit axis in this frame. `lower` and `upper` [rad or m] are the
+    axes x, y, z. `axis` is its unit axis in this frame. `lower` and `upper` [rad or m] are the
     limits, 0 for a fixed joint, infinite if the URDF has none. `effort` [N m or N] and `velocity`
     [rad/s or m/s] are the greatest ones, 0 if the URDF has none. `mimic` is the coupling, None for
     an independent joint.

@@ -2,9 +2,9 @@
 
 A configuration is a hand's pose and joints. Initial guesses of it, the seeds (module `seeds`), are
 refined in rounds (`attempts`). Then their errors and collisions are checked (`candidates`). Four
-solvers share these steps: `solve_ik` reaches given contacts, `solve_contact_first` makes grasps on
-fixed contacts, `solve_joint` also moves the contacts along the surface, and `solve_as_paper` is the
-paper's solver.
+solvers share these steps. `solve_ik` reaches given contacts, and `solve_contact_first` makes grasps
+on fixed contacts. `solve_joint` also moves the contacts along the surface, and `solve_as_paper` is
+the paper's solver.
 """
 
 from torchgrasp.ik.candidates import GraspProblem

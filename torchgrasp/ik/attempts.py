@@ -49,9 +49,9 @@ class Attempts(Generic[Result]):
     """The results of all refined initial guesses so far, and a mask of the contact sets without a
     good one.
 
-    `unsolved` is this mask of the b contact sets; `solves` returns a mask (k,) of the good ones
-    among k results. `results` are the added groups of results, such as `Grasps`, and `rows` holds
-    for each group the index of each result's contact set.
+    `unsolved` is this mask of the b contact sets. `solves` returns a mask (k,) of the good ones
+    among k results. `results` are the added groups of results, such as `Grasps`. `rows` holds for
+    each group the index of each result's contact set.
     """
 
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
@@ -113,7 +113,7 @@ def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
 def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
     """Return the best grasp of each of t contact sets with results, then the index of that set.
 
-    An executable grasp comes first, then one that failed on valid contacts, then others; in a tie
+    An executable grasp comes first, then one that failed on valid contacts, then others. In a tie
     the higher score decides.
     """
 
@@ -207,8 +207,8 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """Return a checked grasp for each initial guess that was tried, as in the paper, best first.
 
-    The guesses are tried ten at a time, in the order of their contact sets, until 10 grasps are
-    executable or 300 were tried.
+    The guesses are tried ten at a time, in the order of their contact sets. This ends when 10
+    grasps are executable or 300 were tried.
     """
     seeds = problem.drop_unreachable(seeds)
     tried = list[Grasps]()

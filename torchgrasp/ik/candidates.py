@@ -28,7 +28,7 @@ from torchgrasp.ik.refine import open_hand, tip_targets
 from torchgrasp.values.planning import Certificate, Contacts, Grasps, IKSeeds
 
 Reachable = Callable[[Tensor], Tensor]
-"""A user's function of hand poses (k, 4, 4) [m] in the object's frame, which returns a mask (k,) of
+"""A user's function of hand poses (k, 4, 4) [m] in the object's frame. It returns a mask (k,) of
 those that an arm reaches.
 """
 # the paper's largest distance [m] of a tip from its contact: about a tip's radius
@@ -74,9 +74,9 @@ class GraspProblem(Value):
         center: the object's centre (3,) [m], or one for each contact set (b, 3). Grasps with the
             contacts' centroid near it score higher.
         reachable: function of hand poses (k, 4, 4) [m] that returns a mask (k,) of the poses that
-            an arm reaches; None means that every pose is reachable.
-        descends: whether the opened hand may start above the pose of the grasp, where its opened
-            fingers would be in the table (`opened_pose`). It then goes down while it closes.
+            an arm reaches. None means that every pose is reachable.
+        descends: whether the opened hand may start above the pose of the grasp. It does where its
+            opened fingers would be in the table (`opened_pose`). It then goes down while it closes.
 
     Raises `BadArgument` if the contacts lack `std_m`.
 
@@ -172,7 +172,7 @@ class GraspErrors(Batch):
     """Errors and clearances of g grasps; `status` is the `Status` of the first error out of
     tolerance.
 
-    `tip_error` [m] is the distance of each of the f tips from its contact, and `normal_angle` [rad]
+    `tip_error` [m] is the distance of each of the f tips from its contact. `normal_angle` [rad] is
     the angle of the contact's inward normal from the pad's axis. `clearance` [m] is the least
     clearance of the links.
     """
@@ -350,8 +350,9 @@ def score(
     better.
 
     It is -(d / `CHECKS.offset` + mu + a / `CHECKS.pad_angle`). Here d is the distance of the
-    contacts' centroid from `center` [m], and a the largest `normal_angle` [rad] of a fingertip. mu
-    is the friction coefficient that forces towards the centroid need (`centred_friction`).
+    contacts' centroid from `center` [m], and a the largest `normal_angle` [rad] of a fingertip. The
+    number mu is the friction coefficient that forces towards the centroid need
+    (`centred_friction`).
     """
     offset = norm(contacts.points.mean(1) - center)
     away = offset / CHECKS.offset

@@ -43,8 +43,8 @@ class Obstacles(Value):
     Attributes:
         field: signed distances [m] from the region that counts as occupied, negative inside.
         distances: distances (k, x, y, z) [m] at the nodes of `field`, one grid for each of the
-            `levels`: from the region that is occupied with at least this probability, and 0 inside
-            it.
+            `levels`. They are from the region that is occupied with at least this probability, and
+            0 inside it.
         levels: k probabilities (k,), ascending.
         hard: whether links must not touch the occupied region. Otherwise a collision only lowers
             the predicted success.
@@ -259,8 +259,8 @@ def collision_cost(
 def clearance_rows(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[ResidualRows]:
-    """Return residuals (g, k) [mm]: by how much the k smallest clearances of each of g hands are
-    below the least wanted ones.
+    """Return residuals (g, k) [mm]. They are by how much the k smallest clearances of each of g
+    hands are below the least wanted ones.
 
     The wanted ones are `SELF_CLEARANCE` between links, which come first, and `CLEARANCE` from
     object, obstacles and table. A larger clearance gives 0. `spatial` are the kinematics of the
@@ -333,7 +333,7 @@ def link_clearance(
     """Return three least clearances (g,) [m] of each hand.
 
     They are of links from the object (tips are left out if `tips_touch`), of tips from the object,
-    and of all links from the table; infinite if the world has no object or no table.
+    and of all links from the table. They are infinite if the world has no object or no table.
     """
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres

@@ -131,10 +131,10 @@ class CobylaRun:
     ) -> list[Float[Tensor, ""]]:
         """Return least clearances [m] of the hand from itself and from the world.
 
-        They are in this order: between the hand's own links; from the object to the palm, to each
-        finger and to each fingertip; from the table to the hand; from obstacles to the hand. Those
-        for which the world has no part are left out. `frames` are the link frames in the hand's
-        frame, and `pose` [m] is the hand's in the object's frame.
+        First are those between the hand's own links. Then follow those from the object to the palm,
+        to each finger and to each fingertip. Last are those from the table and from obstacles to
+        the hand. Those for which the world has no part are left out. `frames` are the link frames
+        in the hand's frame, and `pose` [m] is the hand's in the object's frame.
         """
         world = self.world
         spheres = self.hand.collision_spheres

@@ -1,9 +1,10 @@
 """Configurations of a free-floating hand, and Jacobians of points on its links.
 
-A Jacobian is built from wrenches: the derivative of a residual by a joint or pose motion is the
-product of a wrench about the object's origin and the twist of the motion. g counts configurations.
-The q motions are three translations along the hand's axes, three rotations about them, and the
-joints that the actuated joints move; d = 6 + h counts pose and actuated joints.
+A Jacobian is built from wrenches. The derivative of a residual by a joint or pose motion is the
+product of a wrench and a twist. The wrench is about the object's origin, and the twist is that of
+the motion. Here g counts configurations. The q motions are three translations along the hand's
+axes, three rotations about them, and the joints that the actuated joints move. The number d = 6 + h
+counts pose and actuated joints.
 """
 
 import dataclasses
@@ -63,8 +64,8 @@ class ResidualRows(NamedTuple):
 
     `residual` is a weighted length [mm], or a weighted error of a cosine. `wrench` holds its
     derivatives by a translation [m] and by a rotation [rad] about the object's origin. The
-    derivative by a motion is `wrench` times the twist of the motion where `moves` is 1, and 0 where
-    `moves` is 0.
+    derivative by a motion is `wrench` times the twist of the motion where `moves` is 1. It is 0
+    where `moves` is 0.
     """
 
     residual: Float[Tensor, "g k"]
@@ -78,8 +79,8 @@ class SpatialJacobian(Value):
     object's frame.
 
     `obj_from_link` are the poses (3 x 4) [m] of the l links. `spheres` [m] are the centres of the s
-    collision spheres, `tips` [m] those of the f fingertips, and `pads` the unit normals of their
-    pads. `twists` are those of the q motions: the velocity at the object's origin, then the
+    collision spheres, and `tips` [m] those of the f fingertips. `pads` are the unit normals of
+    their pads. `twists` are those of the q motions: the velocity at the object's origin, then the
     rotation.
     """
 
@@ -118,8 +119,8 @@ class SpatialJacobian(Value):
         """Return the derivatives of k residuals by the d = 6 + h numbers of the hand's pose and
         joints.
 
-        `wrench` and `moves` are the fields of `ResidualRows`: derivatives by a translation and a
-        rotation, and 1 for each motion that counts.
+        `wrench` and `moves` are the fields of `ResidualRows`. They are derivatives by a translation
+        and a rotation, and 1 for each motion that counts.
         """
         by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
         coupling = self.hand.motion.coupling

@@ -56,7 +56,7 @@ def sweep(
     """Return the least clearance [m] of hands at `steps` positions on their paths, each `step` [m]
     back from the one before.
 
-    It is exact with `nodes`, the error in grid spacings of a clearance at the nearest node; with 0
+    It is exact with `nodes`, the error in grid spacings of a clearance at the nearest node. With 0
     it is that at the nearest nodes.
     """
     parts = world_parts(radius, torch.zeros_like(radius, dtype=torch.bool), world)

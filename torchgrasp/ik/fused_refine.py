@@ -107,7 +107,7 @@ def _corner(axes, half, direction, edge):
 
 @inlined
 def _part_boxes(a, b, gap, half_a, half_b, apart, n):
-    """Return separation, push and contact point of two boxes, as `SelfCollision.pushes`; the point
+    """Return separation, push and contact point of two boxes, as `SelfCollision.pushes`. The point
     is relative to the centre of box b.
     """
     best = -math.inf

@@ -50,8 +50,8 @@ def _find_least(numbers, block, least, index):
 
 @inlined
 def _collide(part, frame, spheres, clearance, unit, cost, limit, node):
-    """Return the cost of a placed hand plus that of `collision_cost` for a part of the world, or
-    some cost above the limit.
+    """Return the cost of a placed hand plus that of `collision_cost` for a part of the world. A
+    cost above the limit need not be exact.
     """
     x, y, z = spheres
     if part.kind == 0 or cost >= limit:

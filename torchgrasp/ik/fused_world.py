@@ -18,8 +18,8 @@ from torchgrasp.ik.clearance import CLEARANCE, CollisionWorld
 
 
 class WorldPart(NamedTuple):
-    """A grid of distances, or a plane, or nothing, as `kind` 2, 1 and 0 says; and numbers that are
-    added to the distance of each sphere's centre to give its clearance.
+    """A grid of distances, or a plane, or nothing, as `kind` 2, 1 and 0 says. The numbers `grown`
+    are added to the distance of each sphere's centre to give its clearance.
     """
 
     kind: int
@@ -120,7 +120,7 @@ def exact_clearance(part, p):
 def world_parts(
     radius: Float[Tensor, "s"], touching: Bool[Tensor, "s"], world: CollisionWorld
 ) -> tuple[WorldPart, ...]:
-    """Return object, obstacles and table of a world, in this order; the spheres in the mask
+    """Return object, obstacles and table of a world, in this order. The spheres in the mask
     `touching` may touch object and table.
     """
     none = np.zeros(0)

@@ -1,11 +1,11 @@
 """Contacts, hand pose and joints solved together: the contacts slide on the surface until the hand
 reaches them.
 
-The contact problem (Eqs. 10-13 of the paper, with the margins of `ContactSpec`) and the hand's
-residuals form one least-squares problem. Its unknowns are pose, joints, contact points and
-tensions. A tension, without unit, is the size of the pull between two contacts; the pulls give the
-contact forces. Contact points are normalised: in the shape's frame and unit of length. g counts
-grasps, f fingertips.
+One least-squares problem has two parts. They are the contact problem (Eqs. 10-13 of the paper, with
+the margins of `ContactSpec`) and the hand's residuals. Its unknowns are pose, joints, contact
+points and tensions. A tension, without unit, is the size of the pull between two contacts; the
+pulls give the contact forces. Contact points are normalised: in the shape's frame and unit of
+length. g counts grasps, f fingertips.
 """
 
 import dataclasses
@@ -109,8 +109,8 @@ class JointState(Batch):
         """Return the states of g grasps after a `step` (g, d) of all unknowns.
 
         The d columns are changes of the hand pose (6), the joints [rad], the contact points (3 f)
-        and the tensions, in this order. That of the pose is a translation [m] and a rotation vector
-        [rad] in the hand's axes. Points are normalised, and tensions have no unit.
+        and the tensions. They have this order. That of the pose is a translation [m] and a rotation
+        vector [rad] in the hand's axes. Points are normalised, and tensions have no unit.
         """
         by_hand, by_points, by_tension = step.split(
             [6 + hand.dof, self.points[0].numel(), self.tension.shape[1]], 1
@@ -127,7 +127,7 @@ class JointState(Batch):
 class JointProblem:
     """The least-squares problem of hand and contacts together.
 
-    `shape` is the estimated shape, or a batch of one for each grasp; `contact_problem` holds the
+    `shape` is the estimated shape, or a batch of one for each grasp. `contact_problem` holds the
     constraints of the contacts, and `world` what the hand must not touch.
     """
 

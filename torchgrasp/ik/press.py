@@ -78,8 +78,8 @@ class PressPostures(Batch):
         feet: lowest points (p, f, 3) [m] of the fingertips in the posture's frame.
         strength: greatest normal force (p,) [N] of the weakest pressing finger, by the torques of
             its joints.
-        stiffness: matrix (p, f, 3, 3) [N/m] of each fingertip in the posture's frame: the force
-            with which the drives of the joints resist a displacement of the tip.
+        stiffness: matrix (p, f, 3, 3) [N/m] of each fingertip in the posture's frame. It gives the
+            force with which the drives of the joints resist a displacement of the tip.
         spheres: centres (p, s, 3) [m] of the hand's collision spheres in the posture's frame.
     """
 
@@ -251,8 +251,8 @@ def _stiffness(
 ) -> Float[Tensor, "p f 3 3"]:
     """Return the stiffness [N/m] of each fingertip, turned into the posture's frame.
 
-    It is the inverse of the compliance J K^-1 J^T, for the Jacobian J and the joints' stiffness K
-    with that of coupled joints, plus that of gears and links. `feet` [m] are the tips' lowest
+    It is the inverse of a compliance: J K^-1 J^T plus that of gears and links. J is the Jacobian,
+    and K the stiffness of the joints with those coupled to them. `feet` [m] are the tips' lowest
     points in the hand's frame.
     """
     jacobian = turn[:, None] @ hand.jacobian(joints, feet)  # (p, f, 3, h)

@@ -3,8 +3,8 @@ Levenberg-Marquardt.
 
 The centre of a round fingertip is one radius away from its contact, so that the tip may roll.
 Fingertips of other shapes touch with a fixed point. The contact direction, the inward normal, stays
-inside a cone about the pad's axis. g counts configurations, f fingertips; contacts are in the order
-of the fingers.
+inside a cone about the pad's axis. Here g counts configurations, and f fingertips. Contacts are in
+the order of the fingers.
 """
 
 import dataclasses
@@ -65,9 +65,9 @@ def tip_rows(
     """Return 4 f residuals of fingertips: position errors, then errors of contact directions.
 
     A position error has three components [mm], times `TIP_WEIGHT`. A contact direction has one
-    residual, times `PAD_WEIGHT`: the cosine of the pad's cone less that of the direction's angle
-    from the pad's axis, or 0 inside the cone. `target` [m] holds the wanted centres of the tips,
-    and `normals` the outward unit normals at their contacts, both in the object's frame.
+    residual, times `PAD_WEIGHT`. It is the cosine of the pad's cone less that of the direction's
+    angle from the pad's axis, or 0 inside the cone. `target` [m] holds the wanted centres of the
+    tips. `normals` are the outward unit normals at their contacts, both in the object's frame.
     """
     tips = spatial.hand.tips
     motion = spatial.hand.motion
@@ -100,11 +100,11 @@ def grasp_residuals(
 ) -> Residuals:
     """Return the weighted residuals (g, k) of each hand, then their Jacobian (g, k, 6 + h).
 
-    They are errors of tip positions [mm], of cosines of pad directions (no unit; `tip_rows`) and,
-    with a `world`, lacking clearances [mm] (`clearance_rows`). The Jacobian is by the hand's pose
-    (6) and its h joints. `target` [m] holds the wanted tip centres, and `normals` the outward unit
-    normals at the contacts, in the object's frame. With `tips_touch` the fingertips may touch the
-    object and the table.
+    They are errors of tip positions [mm] and of cosines of pad directions (no unit; `tip_rows`).
+    With a `world` they are also lacking clearances [mm] (`clearance_rows`). The Jacobian is by the
+    hand's pose (6) and its h joints. `target` [m] holds the wanted tip centres, and `normals` the
+    outward unit normals at the contacts, in the object's frame. With `tips_touch` the fingertips
+    may touch the object and the table.
     """
     posture = configuration.joints, configuration.obj_from_hand
     if is_world_fused(world, *posture, target, normals):

@@ -2,8 +2,8 @@
 learned model.
 
 One matrix product compares all contact sets with thousands of postures. Clearances rank the nearest
-postures. r counts contact sets, p assignments of contacts to fingers, s postures, f fingertips, and
-d = 6 f numbers of a feature vector.
+postures. Here r counts contact sets, p assignments of contacts to fingers, s postures, and f
+fingertips. There are d = 6 f numbers of a feature vector.
 """
 
 import dataclasses
@@ -88,8 +88,8 @@ class PostureLibrary(Value):
         joints: actuated joints (s, h) [rad or m].
         vf_from_hand: pose (s, 4, 4) [m] of the hand's root link in the frame vf.
         centres: centres (s, f, 3) [m] of the fingertips, in the frame vf.
-        feature: numbers (s, 6 f) without unit by which postures are compared: centres and pad axes
-            of the fingertips in the frame vf, each divided by a scale.
+        feature: numbers (s, 6 f) without unit by which postures are compared. They are centres and
+            pad axes of the fingertips in the frame vf, each divided by a scale.
         spheres: centres (s, k, 3) [m] of the collision spheres, in the hand's frame.
 
     Raises `BadArgument` for numbers of joints, tips or spheres that are not the hand's.
@@ -179,8 +179,8 @@ def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
 def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
     """Return the frame [m] of three to five points, with the origin at their centroid.
 
-    Its axes are those of the `virtual_frame` of three points: the given ones, or for more than
-    three points the corners of the triangle that `triangle_of` returns.
+    Its axes are those of the `virtual_frame` of three points. They are the given ones, or for more
+    than three points the corners of the triangle that `triangle_of` returns.
     """
     return rigid(virtual_frame(triangle_of(points))[..., :3, :3], points.mean(-2))
 
@@ -373,8 +373,8 @@ def _energies(
 def _likely_assignments(
     wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
 ) -> Int[Tensor, "r a"]:
-    """Return the indices of the a assignments of contacts to fingers whose features are nearest to
-    one of the first postures.
+    """Return the indices of the a assignments of contacts to fingers with the nearest features.
+    They are nearest to one of the first postures.
     """
     if wanted.shape[1] <= SEEDS.assignments:
         return torch.arange(wanted.shape[1], device=wanted.device).expand(len(wanted), -1)
@@ -395,9 +395,9 @@ def query_mixture(
     They follow Eqs. (21)-(24) of the paper. An assignment of contacts to fingers is reachable if
     its energy (Eq. 21, no unit) is below `max_energy`. Each reachable assignment gives `n_seeds`
     seeds: the mean joints given the contacts (Eq. 23), and the mean joints of the most responsible
-    components. The seeds of a contact set are sorted: seeds that touch the surface from outside
-    come first, then by tip error. A contact set without a reachable assignment has no seeds. Raises
-    `BadArgument` for a model of another hand, joint limits or fingertips.
+    components. The seeds of a contact set are sorted. Seeds that touch the surface from outside
+    come first, then the tip error counts. A contact set without a reachable assignment has no
+    seeds. Raises `BadArgument` for a model of another hand, joint limits or fingertips.
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)

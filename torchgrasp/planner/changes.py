@@ -89,8 +89,8 @@ def more_starts(request: Request, ratio: int) -> Change:
 
 
 def _regions(request: Request) -> Iterator[Change]:
-    """Yield changes that each give up a demand on contacts: the region to keep to, the region to
-    avoid, or the task's loads.
+    """Yield changes that each give up a demand on contacts. It is the region to keep to, the region
+    to avoid, or the task's loads.
     """
     for name in ("keep", "avoid", "resist"):
         if getattr(request, name) is not None:
@@ -101,8 +101,8 @@ def _regions(request: Request) -> Iterator[Change]:
 
 
 def _fingers(request: Request) -> Iterator[Change]:
-    """Yield a change to each other set of fingers of the hand; in a mode other than "joint", a
-    change to "joint".
+    """Yield a change to each other set of fingers of the hand. In a mode other than "joint", yield
+    a change to "joint".
     """
     mode = request.mode
     fingers = request.fingers

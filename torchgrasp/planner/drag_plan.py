@@ -1,7 +1,7 @@
-"""The plan of a drag: where and how a hand presses on an object, and along which way it moves it.
+"""The plan of a drag: where and how a hand presses on an object. Also along which way it moves it.
 
-Searches are in the object's upright frame, on the CPU. p counts pressing postures, t directions
-about the vertical, and f fingertips.
+Searches are in the object's upright frame, on the CPU. Here p counts pressing postures, t
+directions about the vertical, and f fingertips.
 """
 
 import dataclasses
@@ -247,8 +247,8 @@ def pressing_force(mass: float, friction: float, table_friction: float) -> float
     """Return the pressing force [N] that drags an object of a `mass` [kg] (Coulomb's law); None if
     the object is too heavy.
 
-    A force N moves it if the fingers' friction N is at least the table's friction times N plus the
-    weight.
+    A force N moves it if m N >= t (N + W). Here m and t are the frictions of fingers and table, and
+    W is the weight.
     """
     weight = mass * TASKS.gravity
     least = table_friction * weight / (friction - table_friction)
@@ -295,7 +295,7 @@ class _PressSearch:
 
     def place(self, tips: int, way: Float[Tensor, "3"]) -> tuple[int, Float[Tensor, "4 4"]] | None:
         """Return the index of the best posture with one or two pressing `tips`, and its pose (4, 4)
-        [m] on the object; None if no posture fits.
+        [m] on the object. Return None if no posture fits.
 
         `way` [m] is the displacement of hand and object, in the upright frame.
         """
@@ -369,9 +369,9 @@ class _PressSearch:
 def _is_steady(postures: PressPostures, ways: Float[Tensor, "t 3"]) -> Bool[Tensor, "p t"]:
     """Return whether each posture presses on steadily while it drags along each of `ways`.
 
-    Where a tip sticks, a motion of the palm along the unit vector w changes the tip's force by K w,
-    for its stiffness K. So each newton of the drag, w . K w, changes the pressing force by
-    -z . K w.
+    Where a tip sticks, a motion of the palm along the unit vector w changes the tip's force by K w.
+    Here K is the tip's stiffness. So each newton of the drag, w . K w, changes the pressing force
+    by -z . K w.
     """
     force = torch.einsum("pfij,tj->ptfi", postures.stiffness, ways)
     along = (force * ways[:, None]).sum(-1)
@@ -429,7 +429,7 @@ class _Top:
         self, good: Bool[Tensor, "n m"], places: Float[Tensor, "*b 2"]
     ) -> tuple[Float[Tensor, "*b"], Bool[Tensor, "*b"]]:
         """Return the height [m] of the top at the nodes nearest to `places` [m], and the map `good`
-        there; beyond the maps nothing is good.
+        there. Beyond the maps nothing is good.
         """
         index = ((places - self.low) / DRAG.cell).round().long()
         size = torch.tensor(good.shape, device="cpu")
@@ -438,8 +438,8 @@ class _Top:
         return self.height[row, column], good[row, column] & inside
 
     def stands(self, outward: Float[Tensor, "3"]) -> Bool[Tensor, "n m"]:
-        """Return whether a tip that drags along the unit vector `outward` can press at each node:
-        the top is flat around it.
+        """Return whether a tip that drags along the unit vector `outward` can press at each node.
+        It can where the top is flat around it.
         """
         angles = _angles(DRAG.ring)
         ring = DRAG.rim * torch.stack([torch.cos(angles), torch.sin(angles)], -1)

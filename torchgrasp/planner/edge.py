@@ -1,4 +1,4 @@
-"""Grasps of a low object at the edge of its table: the hand drags it there, then grasps what hangs
+"""Grasps of a low object at the edge of its table. The hand drags it there, then grasps what hangs
 over.
 
 A fingertip cannot reach below an object that lies flat. So the hand presses on it from above, and
@@ -102,8 +102,9 @@ def plan_edge_grasps(
 
     Raises:
         BadArgument: a table without an edge, or one whose edge is more than 15 mm (`DRAG.behind`)
-            behind the object's estimated centre of mass: the object would fall. Also one whose edge
-            is more than 2 m (`DRAG.farthest`) from all points: its numbers are not metres.
+            behind the object's estimated centre of mass. There the object would fall. Also one
+            whose edge is more than 2 m (`DRAG.farthest`) from all points: its numbers are not
+            metres.
         BadArgument: a friction of the fingertips that is not greater than `table_friction`.
 
     >>> import torch
@@ -152,8 +153,8 @@ def _table_with_edge(spec: ContactSpec) -> Plane:
 
 
 def check_edge(table: Plane, points: Points, name: str) -> None:
-    """Raise `BadArgument` if a table's edge is so far beyond all points (n, 3) [m] of a view that
-    its numbers are not metres.
+    """Raise `BadArgument` if a table's edge is far beyond all points (n, 3) [m] of a view. Its
+    numbers are then not metres.
 
     Errors call the table by `name`.
     """

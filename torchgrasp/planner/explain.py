@@ -94,7 +94,7 @@ class Funnel(Value):
     """The losses of each planning stage, from random initial guesses to executable grasps.
 
     `stages` are in the order of planning. Stage "contacts" turns initial guesses into contact sets.
-    Stage "postures" loses the contact sets that no hand posture comes near; the hand tries the most
+    Stage "postures" loses the contact sets that no hand posture comes near. The hand tries the most
     promising of the others. Stage "grasps" turns them into executable grasps; each failure is
     counted for the check that its best posture fails.
     """
@@ -106,8 +106,8 @@ class Funnel(Value):
     def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
         """Return the losses, counted in the results of four planning stages.
 
-        `plan` is the result of stage "plan", `closed` that of "certify" (only closed contact sets),
-        `seeds` of "query", and `grasps` of "refine".
+        `plan` is the result of stage "plan", and `closed` that of "certify" (only closed contact
+        sets). `seeds` is that of "query", and `grasps` that of "refine".
         """
         far = len(closed) - len(seeds.row.unique())
         stages = (
@@ -232,8 +232,9 @@ class Explanation(Value):
         """A sentence for the user on what would help most.
 
         It names the most helpful change. If the user cannot make it, such as a higher friction, the
-        sentence also names the most helpful one that the user can make. If no change helps, it
-        names the stage that loses most and the reason. If there is a grasp after all, it says so.
+        sentence names one more. It is the most helpful one that the user can make. If no change
+        helps, it names the stage that loses most and the reason. If there is a grasp after all, it
+        says so.
         """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
@@ -281,9 +282,9 @@ def explain_empty(
     grasps.
 
     Each change is tried by planning with it. The changes are: no `keep`, `avoid` or `resist`; other
-    fingers; another shipped hand; wider limits of contacts; higher friction. Further changes are:
-    no table or another one; no neighbours, or neighbours that may be pushed; an arm that reaches
-    every pose.
+    fingers; another shipped hand; wider limits of contacts; higher friction. Further changes are no
+    table or another one, no neighbours, or neighbours that may be pushed. Another is an arm that
+    reaches every pose.
 
     The search ends at a change that the user can make and that gives grasps which are likely to
     succeed. If a grasp is found without a change, no change is tried.
@@ -390,8 +391,8 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
     left out.
 
     A change counts fully for the failures that it prevents. It counts one fifth for other failures
-    of the same stage, because a failed contact set reports only one of its failures. `funnel` holds
-    the losses without a change.
+    of the same stage. The reason is that a failed contact set reports only one of its failures.
+    `funnel` holds the losses without a change.
     """
     contacts = frozenset(status for status in Status if status < Status.OUT_OF_REACH)
     weight = dict[int, float]()

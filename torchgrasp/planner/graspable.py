@@ -221,7 +221,7 @@ def order_by_ease(scene: Scene) -> list[int]:
 
     An object is easy if it is tall, has free space around it, and has nothing above it. The camera
     should be so near that a pixel on the object is smaller than a contact. It should see more of
-    the object than fingertips cover. The object's outline in the image should be convex; otherwise
+    the object than fingertips cover. The object's outline in the image should be convex. Otherwise
     it may be partly hidden, or be two objects that touch. Objects that are larger than all objects
     in our trials, or that the image border cuts off, come last.
     """

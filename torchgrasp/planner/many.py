@@ -145,7 +145,7 @@ def _prepare(request: Request) -> Objects:
 
 
 def _or_refuse(function: Callable[[Request], Result], request: Request) -> Result | Grasps:
-    """Return a function of a request; if its cloud is bad, return an empty set of grasps with the
+    """Return a function of a request. If its cloud is bad, return an empty set of grasps with the
     reason in `meta`.
     """
     try:

@@ -85,10 +85,10 @@ class ShapedObject:
     """One object as the camera saw it, and its estimated shape, in an upright frame (z axis up).
 
     `cloud` and `scene` are what was seen. `cloud` and `table` (a plane, or a height [m] along z)
-    are in the caller's frame, all else in the upright frame. `obj_from_upright` [m] is the
+    are in the caller's frame. All else is in the upright frame. `obj_from_upright` [m] is the
     transform from the upright frame to the caller's. `shape` is the estimated shape, `surface` its
-    mesh [m], and `body` the estimates from which success is predicted. `vague` says that the
-    camera hardly saw the object: few points, one plane, a part beyond the image border, or much of
+    mesh [m], and `body` the estimates from which success is predicted. `vague` says that the camera
+    hardly saw the object. It saw few points, one plane, a part beyond the image border, or much of
     it behind another object. It is also so if the outline is a guess (`Scene.doubts`). `obstacles`
     surround a scene's target; None without a scene.
     """
@@ -164,7 +164,7 @@ class Objects:
         body: the bodies for predictions of success.
         world: what the hand must not touch, in the upright frame.
         loads: w loads of the task for each object (force [N], torque [N m] about the origin of the
-            upright frame); None if grasps need not resist loads.
+            upright frame). None if grasps need not resist loads.
         model: the learned model of the mode.
         buried: whether obstacles prevent that the object is lifted.
         descends: whether the hand may move down while it closes.

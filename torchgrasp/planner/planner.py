@@ -2,8 +2,8 @@
 
 `step` reads like this. Find new contact sets. Choose the most promising. Move the hand onto their
 fixed contacts. Where no posture reaches them, move contacts and hand together ("sliding contacts").
-A contact set is named by its row, which is its index in the `Candidates`. c counts objects; the
-letters k, d, e and s count such indices.
+A contact set is named by its row, which is its index in the `Candidates`. Here c counts objects,
+and the letters k, d, e and s count such indices.
 """
 
 import dataclasses

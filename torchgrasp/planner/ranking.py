@@ -31,8 +31,8 @@ from torchgrasp.values.specs import Ranking
 SURE = 1e-6
 """Probability that stands for 0 in log-odds, so that they stay finite."""
 BEST = 20
-"""Number of best grasps by which a set of fingers is judged: as many as an evaluation tries of a
-view.
+"""Number of best grasps by which a set of fingers is judged. It is as many as an evaluation tries
+of a view.
 """
 
 

@@ -1,5 +1,5 @@
-"""Reports of the planner to an observer: each stage once, with the results of all batches, and the
-end of each batch.
+"""Reports of the planner to an observer. It hears of each stage once, with the results of all
+batches, and of the end of each batch.
 """
 
 import dataclasses

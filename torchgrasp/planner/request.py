@@ -87,11 +87,11 @@ class Request:
     def __post_init__(self) -> None:
         """Raise `BadArgument` for arguments that contradict each other.
 
-        These are an arm of another hand, no load to resist, and a box or mesh to keep to off the
-        object. A `promise` (the share of returned grasps that hold) contradicts a displaced object.
-        The warning `NoEffect` tells of a box or mesh that changes nothing. One to avoid is off the
-        object, or one to keep to holds all of it. Raises `MissingExtra` if compiled loops are asked
-        for without numba.
+        These are an arm of another hand, and no load to resist. Another is a box or mesh to keep to
+        off the object. A `promise` (the share of returned grasps that hold) contradicts a displaced
+        object. The warning `NoEffect` tells of a box or mesh that changes nothing. One to avoid is
+        off the object, or one to keep to holds all of it. Raises `MissingExtra` if compiled loops
+        are asked for without numba.
         """
         is_fused()
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
@@ -162,9 +162,9 @@ class Request:
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:
     """Return one hand for each set of fingers to plan with.
 
-    `fingers` "auto" gives all sets that the hand declares; a name or number gives that set; None
-    gives the hand as it is. Raises `BadArgument` for fingers that the hand does not have. In a mode
-    other than "joint", it is raised for more than three fingers, or "auto", too.
+    `fingers` "auto" gives all sets that the hand declares, and a name or number gives that set.
+    None gives the hand as it is. Raises `BadArgument` for fingers that the hand does not have. In a
+    mode other than "joint", it is raised for more than three fingers, or "auto", too.
     """
     if fingers == "auto":
         if mode != "joint":

@@ -1,7 +1,7 @@
 """The contact sets of a plan that the hand tries, and the state of each in the search for grasps.
 
-A contact set is named by its row, which is its index in the `Candidates`. b counts contact sets, c
-objects, and k such indices.
+A contact set is named by its row, which is its index in the `Candidates`. Here b counts contact
+sets, c objects, and k such indices.
 """
 
 import dataclasses
@@ -248,8 +248,8 @@ def find_candidates(
 
     Of the successful sets of each object, at most `most` are chosen, which lie far apart. In mode
     "paper" with ranking "variance" all are chosen, the most certain first. Chosen sets without
-    force closure are left out. A set whose greatest finger forces do not resist the loads gets the
-    status `NOT_RESISTED` in the plan, and is not chosen. The costs are 0 until `with_costs` sets
+    force closure are left out. A set whose greatest finger forces do not resist the loads is not
+    chosen. In the plan it gets the status `NOT_RESISTED`. The costs are 0 until `with_costs` sets
     them.
 
     Args:
@@ -345,14 +345,14 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     """Return `found` with the cost of each contact set (no unit; less is better).
 
     The cost is log(max(e, `CHOICE.touching`)) + `CHOICE.lever` log(a + `CHOICE.short`). Here a is
-    the set's lever arm (`lever_arm`). e is the least of the `seed_costs` [mm2] of its first
-    `CHOICE.tried` initial postures, and infinite without any.
+    the set's lever arm (`lever_arm`). The cost e is the least of the `seed_costs` [mm2] of its
+    first `CHOICE.tried` initial postures, and infinite without any.
 
     With loads to resist, or a weight to lift, the initial postures of each set are sorted first.
     The greatest share of the load that they carry, at most 1, comes first. A set whose postures all
-    carry less than the load costs from `CHOICE.weak` to 2 `CHOICE.weak` more. A weight meets
-    all of the mean friction: without it, two fingers at a thin wall and one on the floor of a pan
-    would do.
+    carry less than the load costs from `CHOICE.weak` to 2 `CHOICE.weak` more. A weight meets all of
+    the mean friction. Without it, two fingers at a thin wall and one on the floor of a pan would
+    do.
     """
     contacts = found.contacts
     seeds = found.seeds
@@ -379,7 +379,7 @@ def _carried(objects: Objects, found: Candidates, spec: ContactSpec) -> Float[Te
     carry.
 
     A set that carries its load with the least strength of its postures at each contact carries it
-    in all of them: most sets need one linear programme.
+    in all of them. So most sets need one linear programme.
     """
     contacts = found.contacts
     seeds = found.seeds
@@ -443,8 +443,8 @@ def _are_likely(cost: Float[Tensor, "*c m"], most: int) -> Bool[Tensor, "*c m"]:
 
 
 def _table(cloud: CloudIndex, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Tensor, "c m"]]:
-    """Return the indices of the contact sets of each object, in their order, and a mask of the
-    entries that hold one.
+    """Return the indices of the contact sets of each object, in their order. Return also a mask of
+    the entries that hold one.
     """
     count = torch.bincount(cloud, minlength=clouds)
     table = cloud.new_zeros(clouds, int(count.max()))

@@ -78,9 +78,9 @@ def relax(objects: Objects, batches: Iterator[Grasps], deadline: float) -> Itera
     A contact set must be flat within the largest of `FLAT_RADII` that the object allows, which can
     leave few contacts. With relaxed constraints (`ContactSpec.relaxed`) the hand may begin above
     its pose, too, and go down while it closes (`opened_pose`). Of earlier constraints, the batches
-    up to the last one with an executable grasp are kept; of the last constraints, all batches.
-    `batches` are those of the first constraints. After `deadline` [s], a time of `time.monotonic`,
-    constraints are no longer relaxed.
+    up to the last one with an executable grasp are kept. Of the last constraints, all batches are
+    kept. `batches` are those of the first constraints. After `deadline` [s], a time of
+    `time.monotonic`, constraints are no longer relaxed.
     """
     failed = list[Grasps]()
     best = 0.0

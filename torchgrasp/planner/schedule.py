@@ -17,8 +17,8 @@ class ScheduleNumbers:
     tried: int = 250
     """Largest number of contact sets that the hand tries."""
     tried_in_scene: int = 160
-    """Largest number of contact sets that the hand tries in a scene: fewer, because there it tries
-    more postures for each set.
+    """Largest number of contact sets that the hand tries in a scene. They are fewer, because there
+    it tries more postures for each set.
     """
     offered: int = 4
     """Number of planned contact sets for each one that the hand tries."""

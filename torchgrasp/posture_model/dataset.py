@@ -167,8 +167,8 @@ def write_samples(
         spec: number of postures, seed and sampling.
         folder: the folder to write.
         workers: number of threads that draw at the same time, 1 to 1024.
-        observer: function that is called at the start with the number of postures on disk, then
-            with the number in each new chunk.
+        observer: function that is called at the start with the number of postures on disk. Later it
+            gets the number in each new chunk.
 
     Raises:
         BadArgument: workers outside [1, 1024].

@@ -1,10 +1,10 @@
 """Expectation-maximisation of Gaussian mixtures (Eqs. 19-20), in one process or in several.
 
 torchrun starts several processes, which each hold a part of the data. A data row x is one sample of
-d numbers. The log-density of a Gaussian is linear in its f features [1, x_i, x_i x_j], so each step
+d numbers. The log-density of a Gaussian is linear in its f features [1, x_i, x_i x_j]. So each step
 is one matrix product. Sums of the features, weighted by responsibilities, suffice for the
 maximisation and are small enough to add over processes. The data must have mean 0 and variance 1 in
-every column; otherwise differences of such sums would lose their digits. All numbers are therefore
+every column. Otherwise differences of such sums would lose their digits. All numbers are therefore
 standardised, without unit. n counts samples, m the Gaussians (components) of the mixture.
 """
 
@@ -134,8 +134,8 @@ class FitProgress(Value):
         reseeded: number of times (m,) that each Gaussian collapsed and got a new place. The
             likelihood may fall after that.
         log_likelihood: mean log-likelihood (t,) [nats] of the standardised data before each step.
-        jumped: whether the likelihood may fall: a Gaussian got a new place in the last step, or the
-            next step uses another subset of the samples.
+        jumped: whether the likelihood may fall. It may if a Gaussian got a new place in the last
+            step, or the next step uses another subset of the samples.
         rows: number of samples that the last step used; 0 before the first step.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])

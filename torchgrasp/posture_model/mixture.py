@@ -36,8 +36,8 @@ CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")
 PAPER_ENERGY = 2.0
 """The paper's greatest mixture energy f_i (no unit), Eq. (21), of a code that the hand reaches."""
 DEFAULT_ENERGY = 6.295793622
-"""The default greatest energy (no unit) of a code that the hand reaches: half the 95 % quantile of
-chi-square with 6 degrees of freedom.
+"""The default greatest energy (no unit) of a code that the hand reaches. It is half the 95 %
+quantile of chi-square with 6 degrees of freedom.
 """
 UNIT_ERROR = 1e-3  # greatest error of a unit normal's length
 # positions, as shares of the joints' ranges, in the postures that identify a hand
@@ -50,7 +50,7 @@ def encode_fingertips(
 ) -> Float[Tensor, "*b q"]:
     """Return the contact code q = (L, N) of f points [m] with unit normals, Eq. (18).
 
-    L_i is the distance [m] of point i from the centroid; N holds the cosines n1.n2, n1.n3, n2.n3
+    L_i is the distance [m] of point i from the centroid. N holds the cosines n1.n2, n1.n3, n2.n3
     and so on of all pairs of normals. No rigid motion changes the code. Fingertips have the same
     code as the contacts that they touch. Mirror images have this code too: check every match.
     """
@@ -169,7 +169,7 @@ class GraspMixture(GaussianMixture):
     19-20).
 
     `load_mixture` reads it, and `fit_mixture` fits it. `energy` tells whether the hand reaches
-    contacts of a given code, and `joints` returns the joints that it then most likely has.
+    contacts of a given code. `joints` returns the joints that it then most likely has.
 
     Its d dimensions are the h joints [rad or m], in the hand's order, then a contact code. A code
     has the distances L1 L2 L3 [m] of three contacts from their centroid. Then come the cosines N1
@@ -235,7 +235,7 @@ class GraspMixture(GaussianMixture):
     def energy(
         self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]
     ) -> Float[Tensor, "*b"]:
-        """Return the energy (*b,) (no unit) of each contact code, Eq. (21); a low one means that
+        """Return the energy (*b,) (no unit) of each contact code, Eq. (21). A low one means that
         the hand reaches it.
 
         It is half the squared Mahalanobis distance of the code from the nearest component. The hand
@@ -289,7 +289,7 @@ class GraspMixture(GaussianMixture):
 
         `joints` (*b, k, h) [rad or m] are each component's mean given the code. `responsibilities`
         (*b, k) are the components' probabilities given the code, h_i in Eq. (23), the largest
-        first. Use `modes` where several postures have the same code: the mean that `joints` returns
+        first. Use `modes` where several postures have the same code. The mean that `joints` returns
         may then be none of these postures.
 
         Args:

@@ -37,10 +37,10 @@ def roll_contacts(
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"]]:
     """Return (points, normals) of random contacts off the centres of the fingertips' pads.
 
-    The points [m] and the fingertips' outward unit normals there are in the hand's frame, for n
-    postures `joints` [rad] of three fingers. `generator` tilts each normal at random from the pad's
-    axis, with Gaussian components of the tilt, cut off at the pad's cone. On a round fingertip the
-    contact moves to the point of the sphere with this normal; on a flat pad it stays in place.
+    The points [m] and the fingertips' outward unit normals there are in the hand's frame. They are
+    for n postures `joints` [rad] of three fingers. `generator` tilts each normal at random from the
+    pad's axis. The tilt has Gaussian components, cut off at the pad's cone. On a round fingertip
+    the contact moves to the point of the sphere with this normal. On a flat pad it stays in place.
     """
     points, axes = hand.fingertips(joints)
     cone = hand.tips.cone.to(axes)
@@ -92,8 +92,8 @@ BLOCK_POSTURES = 2_000  # postures that a generator draws at a time; fixed for t
 MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's million (Sec. 6.3).
 LEAST_KEPT = 1e-3
 BLOCKS = 10
-"""Least share of postures that are kept, and the number of blocks after which it is checked: with
-a smaller share, a hand would draw for hours.
+"""Least share of postures that are kept, and the number of blocks after which it is checked. With a
+smaller share, a hand would draw for hours.
 """
 Sampling = Literal["uniform", "grasping"]
 """Which of the random postures without self-collision are taken.

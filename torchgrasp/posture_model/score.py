@@ -1,4 +1,4 @@
-"""Quality of a learned model: errors on held-out postures (Sec. 6.3), and the Bayesian information
+"""Quality of a learned model: errors on held-out postures (Sec. 6.3). Also the Bayesian information
 criterion (BIC) by number of components (Fig. 6).
 """
 

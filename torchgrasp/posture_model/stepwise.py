@@ -1,9 +1,9 @@
 """EM on growing random subsets: most steps use few rows, and the last steps all rows (Eqs. 19-20).
 
-A row is one sample. The fit to a subset is the start at the next subset, which contains the first
+A row is one sample. The fit to a subset is the start at the next subset. This contains the first
 and is twice as large. Fits that grow by one component each give a criterion for every number of
 components. Stepwise EM of minibatches (Cappe and Moulines 2009,
-https://doi.org/10.1111/j.1467-9868.2009.00698.x) was tried, too: it found less likely mixtures in
+https://doi.org/10.1111/j.1467-9868.2009.00698.x) was tried, too. It found less likely mixtures in
 the same time.
 """
 

@@ -261,8 +261,8 @@ def standardised_rows(
 
     The rows have mean 0 and variance 1 in each of the d dimensions: the joints [rad], then the
     code. `distributed`: whether `samples` are only the part of this process. Raises `BadArgument`
-    for codes not of three fingertips, too few samples for so many `components`, or a dimension that
-    does not vary.
+    for codes not of three fingertips, or too few samples for so many `components`. Raises it also
+    for a dimension that does not vary.
     """
     if samples.q.shape[1] != len(CODE_NAMES):
         found = f"codes of {samples.q.shape[1]} numbers"

@@ -87,7 +87,7 @@ def scene_of(
 
 
 def _with_found(scene: Scene, labels: Int[Tensor, "h w"], given: np.ndarray) -> Scene:
-    """Return the scene with the saved `labels` of those objects whose labels are not `given`: the
+    """Return the scene with the saved `labels` of those objects whose labels are not `given`. The
     library found their pixels, and none of them is on the table.
     """
     saved = labels[tuple(scene.pixels.T)]

@@ -46,7 +46,7 @@ class MaskNumbers:
     told: float = 0.05
     """Share of a mask's pixels whose removal is mentioned in a note; a smaller share is not."""
     reach: float = 0.04
-    """Greatest shift of a mask that is looked for, as a share of the image's width: colour and
+    """Greatest shift of a mask that is looked for, as a share of the image's width. Colour and
     depth that are not aligned differ by 2 % or so.
     """
     gained: float = 0.1
@@ -196,7 +196,7 @@ def _runs(mask: Mapping[str, Any], shape: tuple[int, ...], name: str) -> Bool[Te
 
 
 def _run_lengths(text: bytes) -> list[int]:
-    """Return run lengths from COCO's text, 5 bits a letter; from the fourth on, it holds run i
+    """Return run lengths from COCO's text, 5 bits a letter. From the fourth on, it holds run i
     minus run i - 2.
     """
     more = 1 << LETTER_BITS
@@ -307,10 +307,10 @@ def label_again(
 ) -> Int[Tensor, "h w"]:
     """Return the label of each pixel after another support has replaced the former table.
 
-    Labels that the user gave (`given`) lose pixels on the support, and gain pixels of their objects
-    that the former table hid. Other objects are segmented again, and each keeps the label of most
-    of its former pixels. The label `first` is assigned before the others. `labels` (h, w) are the
-    labels until now.
+    Labels that the user gave (`given`) lose pixels on the support. They gain pixels of their
+    objects that the former table hid. Other objects are segmented again, and each keeps the label
+    of most of its former pixels. The label `first` is assigned before the others. `labels` (h, w)
+    are the labels until now.
     """
     view = TableImage.of(image, support)
     before = TableImage(image, view.points, SupportPlane(former))
@@ -398,8 +398,8 @@ def _shifted(mask: Bool[Tensor, "h w"], target: Bool[Tensor, "h w"]) -> list[str
 
 
 def _removed(mask: str, count: int, seen: int, where: str = "the support") -> list[str]:
-    """Return a list with one sentence that `count` of `seen` pixels were removed from a mask; empty
-    if they are few.
+    """Return a list with one sentence that `count` of `seen` pixels were removed from a mask. It is
+    empty if they are few.
     """
     if count <= MASKS.told * seen:
         return []

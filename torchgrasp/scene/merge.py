@@ -202,8 +202,8 @@ def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> lis
 
 
 def _gaps(trees: list[Any]) -> np.ndarray:
-    """Return the gaps [m] between each two point sets (KD-trees): 0 if they meet at two ends,
-    infinite if they are far apart.
+    """Return the gaps [m] between each two point sets (KD-trees). They are 0 if they meet at two
+    ends, infinite if they are far apart.
     """
     low = np.stack([tree.mins for tree in trees])
     high = np.stack([tree.maxes for tree in trees])
@@ -231,7 +231,7 @@ def _gaps(trees: list[Any]) -> np.ndarray:
 class _Body:
     """Pieces of one object: their indices, their number of points, and some of these points.
 
-    Points (n, 3) [m] have z as the height above the table; `hull` is that of their footprint, and
+    Points (n, 3) [m] have z as the height above the table, and `hull` is that of their footprint.
     `foot` and `top` [m] are their lowest and highest heights without outliers.
     """
 
@@ -302,7 +302,7 @@ def _upon(small: _Body, large: _Body) -> bool:
 
 
 def _floating(view: TableImage, pieces: Int[Tensor, "h w"]) -> Bool[Tensor, "k"]:
-    """Return a mask of the pieces that float: the table is seen below most of their lower edge,
+    """Return a mask of the pieces that float. The table is seen below most of their lower edge,
     which is high.
     """
     image = view.image

@@ -2,8 +2,8 @@
 else.
 
 Space in front of a measured depth is free. Behind an object's visible surface, a model estimates
-the probability from the object's visible size and the place behind the surface. `scripts/train.py
-occupancy` fits the model.
+the probability. It uses the object's visible size and the place behind the surface.
+`scripts/train.py occupancy` fits the model.
 """
 
 import dataclasses
@@ -106,8 +106,8 @@ class Shadows(Value):
     Attributes:
         image: the image itself, with its camera.
         depth: its depth [m] with small gaps filled.
-        owner: the label of the object, 0 for the table, -1 where nothing was measured, or another
-            negative number for each object without label.
+        owner: the label of the object, 0 for the table, or -1 where nothing was measured. Each
+            object without label has another negative number.
         points: the measured point [m] of each pixel, in the frame of the image's pose; NaN where
             nothing was measured.
     """
@@ -243,9 +243,9 @@ def load_occupancy_model() -> dict[str, Any]:
 def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]:
     """Return the probability that n places of a kind are full.
 
-    Their log-odds are a sum of piecewise linear functions, one of each of f features. `kind` is
-    "thing" with the features of `shadow_features`; "target" with the depth behind the surface and
-    the height z [m]; or "unseen" with the height z [m].
+    Their log-odds are a sum of piecewise linear functions, one of each of f features. `kind`
+    "thing" has the features of `shadow_features`, and "target" the depth behind the surface and the
+    height z [m]. "unseen" has the height z [m].
     """
     model = load_occupancy_model()[kind]
     odds = torch.full_like(features[:, 0], model["bias"])
@@ -264,9 +264,9 @@ def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
 
     The voxels have a side of 5 mm (`OCCUPANCY.spacing`), and extend 0.25 m
     (`OCCUPANCY.sideways`) around the target. They reach from the table up to 0.04 m
-    (`OCCUPANCY.above`) above the highest measured point of an object in this area. Without a
-    table they begin at the lowest one. The probabilities are float64 on the scene's device, but
-    computed on the CPU.
+    (`OCCUPANCY.above`) above the objects. This is above the highest measured point of an object in
+    this area. Without a table they begin at the lowest one. The probabilities are float64 on the
+    scene's device, but computed on the CPU.
 
     Args:
         scene: the scene in a frame with z up, as `Scene.to_upright` returns it. Its table, if it

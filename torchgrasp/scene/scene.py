@@ -74,7 +74,7 @@ class SceneNumbers:
     """Least distance [m] of such an object in front of the target: objects beside it cover nothing.
     """
     covered: float = 0.2
-    """Share of the target's outline that one object covers, above which it is told: then a fifth of
+    """Share of the target's outline that one object covers, above which it is told. Then a fifth of
     the target is usually hidden.
     """
     afloat: float = 0.15
@@ -110,8 +110,8 @@ class Scene(Value):
         table: the plane that the objects stand on, or None if it is unknown.
         target: label of the object to be grasped, or None if none is chosen.
         others: other planes that objects could stand on, the more plausible first.
-        notes: what was changed or is doubtful, a sentence each: pixels removed from a given mask or
-            label, or a table or a camera in an unlikely place.
+        notes: what was changed or is doubtful, a sentence each. Examples are pixels removed from a
+            given mask or label, or a table or a camera in an unlikely place.
         given: labels of objects whose pixels the user gave, as labels or as a mask. The library
             found the other objects.
 
@@ -149,8 +149,8 @@ class Scene(Value):
         """Return the scene that a pinhole camera's depth image shows.
 
         The objects are those of `labels`. Without labels they are the connected components above
-        the table. Pixels on the table get the label 0, and so do flying pixels, which lie between
-        a near and a far surface. A `mask` or a `point` chooses the target; without both there is
+        the table. Pixels on the table get the label 0. So do flying pixels, which lie between a
+        near and a far surface. A `mask` or a `point` chooses the target; without both there is
         none. Points, planes and directions are in the frame "obj", to which `camera_pose` leads.
 
         Args:
@@ -257,8 +257,8 @@ class Scene(Value):
 
         Raises:
             BadArgument: no viewpoint or several; points all around the camera.
-            BadArgument: labels or a mask of another size; a mask or box without points; a mask of
-                fractions, or of several values beside 0.
+            BadArgument: labels or a mask of another size; a mask or box without points. Also a mask
+                of fractions, or of several values beside 0.
             BadArgument: more than one of labels, mask and box; a mask or box beside a point; a
                 pixel as the point.
             BadArgument: a target, a table or a direction that `from_depth` refuses.
@@ -312,7 +312,7 @@ class Scene(Value):
         return scene._chosen(given is not None, inside is not None, point)
 
     def _chosen(self, labelled: bool, masked: bool, point: Any) -> "Scene":
-        """Return the scene with the target that a mask or a point chooses, and with the labels that
+        """Return the scene with the target that a mask or a point chooses. It has the labels that
         the user gave.
         """
         given = self.things if labelled else ()
@@ -338,7 +338,7 @@ class Scene(Value):
         """Return the scene with another target.
 
         Args:
-            target: a label of `things`; or a pixel (u, v) of the image, column first; or a point
+            target: a label of `things`, or a pixel (u, v) of the image, column first. Or a point
                 (x, y, z) [m] in the frame "obj".
 
         For a pixel or a point, the target is the object of the nearest measured point.
@@ -388,8 +388,8 @@ class Scene(Value):
         * Objects could also stand on another plane than `table`.
         * Two objects touch, so that the border between them is a guess; not if both are `given`.
         * An object that is not `given` has a crease: it may be several objects.
-        * The target is not `given`, and has a jump in depth, or is long and has gaps in its outline:
-          it may be several, too.
+        * The target is not `given`, and has a jump in depth, or is long with gaps in its outline.
+          It may be several objects, too.
         * The target is cut off at the border of the image.
         * Another object hides much of the target.
         * The target has `doubts`, so that its success is unknown.
@@ -414,8 +414,9 @@ class Scene(Value):
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Why the target may be several objects, or a part of one, a sentence each: those of
-        `advice` on creases and jumps in it, on gaps in its outline, and on objects that touch it.
+        """Why the target may be several objects, or a part of one, a sentence each. They are those
+        of `advice` on creases and jumps in it, on gaps in its outline, and on objects that touch
+        it.
 
         Empty without a target. Empty for a target that is `given`, too: its outline is no guess.
         """
@@ -473,8 +474,8 @@ class Scene(Value):
 
     @property
     def covers(self) -> dict[int, float]:
-        """The objects that hide much of the target, by label: the share of its outline before which
-        each of them stands.
+        """The objects that hide much of the target, by label. The number is the share of its
+        outline before which each stands.
 
         Only shares above a fifth (`SCENE.covered`) are listed. Without a target there are none.
         """

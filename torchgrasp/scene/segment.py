@@ -21,7 +21,7 @@ from torchgrasp.scene.table_image import TableImage
 class SegmentNumbers:
     """Parameters of the segmentation of a depth image into objects on a table.
 
-    Counts of pixels are for an image of 640 x 480, and are scaled to the size of others, unless it
+    Counts of pixels are for an image of 640 x 480. They are scaled to the size of others, unless it
     is said otherwise.
     """
 
@@ -34,7 +34,7 @@ class SegmentNumbers:
     near: float = 0.005
     """A pixel at a jump of depth joins an object within this distance [m]."""
     near_pixels: float = 4.0
-    """A pixel of a given mask also joins one within this distance, in widths of a pixel: pixels of
+    """A pixel of a given mask also joins one within this distance, in widths of a pixel. Pixels of
     a small image lie farther apart.
     """
     rounds: int = 12
@@ -81,9 +81,9 @@ NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0))
 def segment(view: TableImage) -> Int[Tensor, "h w"]:
     """Return the label of each pixel: 1, 2, ... for objects, the largest first, and 0 for none.
 
-    A piece is a connected component of the pixels above the table, without a jump of depth and
-    without a crease. Pieces of one object are merged. Pixels at jumps go to the object whose
-    surface they lie on, if there is one. Pixels beside the region of the support get 0.
+    A piece is a connected component of the pixels above the table. It has no jump of depth and no
+    crease. Pieces of one object are merged. Pixels at jumps go to the object whose surface they lie
+    on, if there is one. Pixels beside the region of the support get 0.
     """
     smooth = view.smooth
     risen = _risen(view)
@@ -195,8 +195,8 @@ def find_components(smooth: TableImage, core: Tensor) -> Int[Tensor, "h w"]:
 def _grown(
     view: TableImage, labels: Tensor, risen: Tensor, near: Float[Tensor, "h w"] | None = None
 ) -> Int[Tensor, "h w"]:
-    """Return labels in which pixels above the table without a label get that of the nearest point,
-    if one is near.
+    """Return labels with more pixels above the table. A pixel without a label gets that of the
+    nearest point, if one is near.
 
     `near` is the greatest distance [m] of each pixel from such a point, by default `SEGMENT.near`.
     """
@@ -268,8 +268,8 @@ def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
 
 
 def _is_noise(view: TableImage, deviations: Tensor, labels: Int[Tensor, "h w"], k: int) -> bool:
-    """Return whether the small object k is an uneven place of the table, or a fringe of a body many
-    times as large.
+    """Return whether the small object k is an uneven place of the table, or a fringe of a much
+    larger body.
 
     `deviations` (h, w) are heights above the table over the noise's.
     """

@@ -22,7 +22,7 @@ class HeightNumbers:
     band: float = 0.010
     """Mean heights below this [m], of either sign, measure the noise of the table."""
     foot: float = 0.030
-    """Greatest distance [m] from the table of a pixel whose height is averaged: the mean at an
+    """Greatest distance [m] from the table of a pixel whose height is averaged. The mean at an
     object's foot leaves out higher parts.
     """
     normal: float = 1.4826

@@ -1,9 +1,9 @@
-"""The shapes of many clouds in one value: each entry of a batch of points belongs to the shape of
+"""The shapes of many clouds in one value. Each entry of a batch of points belongs to the shape of
 its own cloud.
 
 Some stages work on batches of contacts or hands. They ask a shape for values at the points of each
-entry, and continue with those of its `rows` that are left. A `ShapeGP` is the one shape of all
-entries. A `ShapeBatch` stacks the observations of c clouds, and knows the cloud of each entry.
+entry. Then they continue with those of its `rows` that are left. A `ShapeGP` is the one shape of
+all entries. A `ShapeBatch` stacks the observations of c clouds, and knows the cloud of each entry.
 """
 
 import dataclasses
@@ -132,8 +132,8 @@ class Walls(Value):
         """Return the variance k A k that the observations explain, and k A, for each line k of
         `rows`.
 
-        Line q holds the covariances k of one number with the observations of the surface `wall[q]`,
-        and A is the inverse covariance of these observations.
+        Line q holds the covariances k of one number with the observations of the surface `wall[q]`.
+        A is the inverse covariance of these observations.
         """
 
         def explain(own: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -167,7 +167,7 @@ class Walls(Value):
 class ShapeBatch(Value):
     """The shapes of c clouds, for a batch in which each entry belongs to one cloud.
 
-    Points given to a method have the entries as axis 0; those of entry r belong to the cloud with
+    Points given to a method have the entries as axis 0. Those of entry r belong to the cloud with
     the index `owner[r]`. Numbers of a shape, such as its `scale`, are tensors with one number for
     each entry. Distances at normalised points are normalised, too.
 

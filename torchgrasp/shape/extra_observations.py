@@ -62,13 +62,13 @@ class ObservationNumbers:
     rim_normal: float = 0.5
     hidden_normal: float = 0.25
     vessel_rim_normal: float = 0.5
-    """Standard deviations of unit normals: on the seen side, on the outline, on the hidden side,
-    and on the outline of a vessel.
+    """Standard deviations of unit normals on the seen side, on the outline, and on the hidden side.
+    The last is for the outline of a vessel.
     """
     rim: float = 0.002
     """Standard deviation of a point of the outline [m]."""
     free: float = 0.003
-    """Standard deviation [m] of a distance from a point in free space to the surface; the distance
+    """Standard deviation [m] of a distance from a point in free space to the surface. The distance
     is only a lower bound.
     """
 
@@ -82,8 +82,8 @@ class FreeNumbers:
 
     outline_error: float = 0.005
     estimated_error: float = 0.010
-    """Distances [m] by which the object may reach beyond its outline, as a camera loses rims: if
-    the camera is given, and if it was estimated.
+    """Distances [m] by which the object may reach beyond its outline, as a camera loses rims. The
+    first is for a given camera, the second for an estimated one.
     """
     radius: float = 1.15
     """Ratio of the radius within which free space is probed to that of all points."""
@@ -118,7 +118,7 @@ class MiddleNumbers:
     side: float = 0.8
     """Greatest vertical part of the unit normals of a side: a floor may be thicker than known."""
     over: float = 0.5
-    """Height of a point above the rim, in radii of the mouth: the inner surface has no lid, so it
+    """Height of a point above the rim, in radii of the mouth. The inner surface has no lid, so it
     surrounds free space there, too.
     """
 

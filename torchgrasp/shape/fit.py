@@ -103,7 +103,7 @@ def fit_shape(
             unit is the shape's `scale` [m], about the object's radius. If `support` is "paper",
             also that of a component of a normal.
         budget: number of observed points, 25 to 1000 (`SHAPE.budget`). Up to 20 of them lie on a
-            sphere around the object, and one in its centre if that is inside. The others are the
+            sphere around the object. One lies in its centre if that is inside. The others are the
             most informative points of the cloud. The outline and the hidden side come in addition.
             None means 85 for "camera" (`SHAPE.camera`) and 70 for "paper" (`SHAPE.paper`). "sure",
             the paper's rule, adds points until no point's variance (squared normalised units)
@@ -117,16 +117,16 @@ def fit_shape(
             nothing, of which `NoEffect` warns.
         kernel: "thin_plate", "matern52" or "rbf", whose length follows from psi; or your own
             `Kernel` of normalised distances.
-        criterion: the most informative point has the greatest "variance" of its distance, the
-            greatest "error" |mean distance|, or with "both" the greatest |error| +
-            2 sqrt(variance).
+        criterion: the most informative point has the greatest "variance" of its distance, or the
+            greatest "error" |mean distance|. With "both" it has the greatest |error| + 2
+            sqrt(variance).
 
     Raises:
-        BadArgument: an argument out of range; a table above the object's foot or a camera, or more
-            than 2 m below the object's top.
-        BadArgument: a cloud that `check_cloud` refuses; more than 16 cameras; a camera that cannot
-            have seen its points, or that the normals point away from; for "camera" a whole surface
-            without normals.
+        BadArgument: an argument out of range; a table above the object's foot or a camera. Also a
+            table more than 2 m below the object's top.
+        BadArgument: a cloud that `check_cloud` refuses; more than 16 cameras; for "camera" a whole
+            surface without normals. Also a camera that cannot have seen its points, or that the
+            normals point away from.
         BadArgument: a kernel whose profile requires a gradient (use `condition`).
         TooFewPoints: fewer than 4 distinct points, or fewer than 10 of one of several views.
         SuspiciousScale: an extent outside [5 mm, 2 m].
@@ -181,8 +181,8 @@ def fit_upright(
     """Return the shape fitted to a cloud [m] without duplicates in a frame whose z axis points up.
 
     `table` is the table's height [m]; None means no table. `seed` is the random seed, and `options`
-    are those of `fit_shape`. `in_image` says that the points are pixels of a depth image, so that
-    they need not be compared with their camera.
+    are those of `fit_shape`. `in_image` says that the points are pixels of a depth image. Then they
+    need not be compared with their camera.
     """
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))
@@ -283,9 +283,9 @@ def condition(
     """Return the shape as a Gaussian process posterior, given normalised observations, Eqs. (7)-(9)
     of the paper.
 
-    The result is differentiable, to any order, in the observations, in the frame's centre, and in
-    tensors of the kernel's profile. The length psi of a kernel by name and the domain's radius are
-    constants.
+    The result is differentiable, to any order, in the observations and in the frame's centre. It is
+    so, too, in tensors of the kernel's profile. The length psi of a kernel by name and the domain's
+    radius are constants.
 
     Args:
         observations: signed distances and normals at n points, with their noise, all normalised.
@@ -325,8 +325,8 @@ def condition(
 
 
 def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> None:
-    """Warn if the image border cuts the object off, the view has a gap, or two bodies stand on the
-    table.
+    """Warn if the image border cuts the object off, or the view has a gap. Warn also if two bodies
+    stand on the table.
     """
     if outline.cut:
         warn_user(

@@ -56,7 +56,7 @@ def _mean(
     b: Float[Tensor, "#q 3 near"],
     bent: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return mean (q,), gradient (q, 3) and, if `bent`, Hessian (q, 3, 3) with weights `a` of
+    """Return mean (q,), gradient (q, 3) and, if `bent`, Hessian (q, 3, 3). The weights are `a` of
     distances and `b` of normals, the same or others for each point.
     """
     found = x.new_empty(len(x)), x.new_empty(len(x), 3), x.new_empty(len(x) * bent, 3, 3)
@@ -85,8 +85,8 @@ def _psi_of(kernel: Kernel) -> float:
 
 @inlined
 def sum_thin_plate(x, y, a, b, psi, bent):
-    """Return the sums of `evaluate_mean_jet` at a point x over the n points y (3, n): distance,
-    gradient and, if `bent`, the six numbers xx, yy, zz, xy, xz and yz of the Hessian.
+    """Return the sums of `evaluate_mean_jet` at a point x over the n points y (3, n). They are
+    distance, gradient and, if `bent`, the six numbers xx, yy, zz, xy, xz and yz of the Hessian.
     """
     distance = g0 = g1 = g2 = trace = xx = yy = zz = xy = xz = yz = 0.0
     for j in range(len(a)):

@@ -148,7 +148,7 @@ class HollowShape(ShapeGP):
         """Return the variance (q,) of the signed distance at q points `x` (q, 3) that `normalise`
         returned.
 
-        The variance is that of the surface that applies at each point (`wall_at`), in squared
+        The variance is that of the surface that applies at each point (`wall_at`). It is in squared
         normalised units: one unit is `scale` [m]. It is not calibrated; `predict(...).std_m` is.
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.variance(own))

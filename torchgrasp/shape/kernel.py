@@ -40,7 +40,7 @@ class ProfileNumbers:
     near_zero: float = 1e-4
     """Normalised distance r below which k(r) is replaced by its Taylor polynomial of degree 4."""
     power: float = 1.5
-    """Points coincide if r^2 is at most this power of the rounding error: otherwise rounding of the
+    """Points coincide if r^2 is at most this power of the rounding error. Otherwise rounding of the
     third derivative would dominate.
     """
 
@@ -120,7 +120,7 @@ def differentiate(
     """Return the first `count` (1 to 4) of k and its derivatives by u = r^2 / 2, by autograd.
 
     They are differentiable by u to any order, but at r = 0 only those up to (d/du)^2 k are right.
-    Higher ones, and infinite ones, count as 0 there: covariances and their second derivatives
+    Higher ones, and infinite ones, count as 0 there. Covariances and their second derivatives
     multiply them by a power of r.
     """
     least = PROFILE.near_zero**2 / 2
@@ -307,10 +307,11 @@ def cross_covariance(
     """Return the covariance of distance (first) and gradient (x, y, z) at x with the observations
     at y.
 
-    The q points `x` and n points `y` are normalised. With d = x - y, and derivatives by r^2 / 2,
-    the blocks are k, k' d, -k' d^T and -k' I - k'' d d^T, Eqs. (2)-(5) of the paper. The last axis
-    holds the distances at all y, then each gradient component at the first `n_oriented` points,
-    which have normals. With a leading axis, `y` holds the observations of each x.
+    The q points `x` and n points `y` are normalised. Let d = x - y, and take derivatives by r^2 /
+    2. Then the blocks are k, k' d, -k' d^T and -k' I - k'' d d^T, Eqs. (2)-(5) of the paper. The
+    last axis holds the distances at all y. Then follows each gradient component at the first
+    `n_oriented` points, which have normals. With a leading axis, `y` holds the observations of each
+    x.
     """
     if not (kernel.closed_form and is_plain(x, y)):
         return _differentiable_cross_covariance(kernel, x, y, n_oriented)

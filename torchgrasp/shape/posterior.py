@@ -56,8 +56,8 @@ class ChunkNumbers:
 CHUNK = ChunkNumbers()
 # least eigenvalue of a covariance, over the prior variance: less is more than rounding
 LEAST_EIGENVALUE = -1e-8
-# eigenvalue over the prior variance that counts as zero in derivatives: above rounding, and that of
-# points one millionth of the shape's size apart
+# eigenvalue over the prior variance that counts as zero in derivatives. It is above rounding, and
+# above that of points one millionth of the shape's size apart
 SINGULAR = 1e-12
 
 
@@ -85,7 +85,7 @@ class Posterior(Value):
         """The matrix L^-T (r, r), where L is the Cholesky factor `factor`, as a list of blocks of
         its columns.
 
-        Each block has all columns of a range, and the rows down to the last of them: the rows below
+        Each block has all columns of a range, and the rows down to the last of them. The rows below
         are zero.
         """
         rows = len(self.factor)
@@ -187,9 +187,9 @@ class Posterior(Value):
         """
         # The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2).
         # Here a_j is the weight of the distance at the observed point x_j, b_j that of its normal.
-        # The variance is k0 - k*^T A k*: k0 is the prior variance, k* the covariance of the point
-        # with the data, and A the inverse covariance of the data. Its gradient is -2 times the
-        # gradient of a mean with the weights A k*.
+        # The variance is k0 - k*^T A k*. Here k0 is the prior variance, k* the covariance of the
+        # point with the data, and A the inverse covariance of the data. Its gradient is -2 times
+        # the gradient of a mean with the weights A k*.
         evaluate = partial(_differentiable_jet, self)
         if self._is_plain(x):
             evaluate = partial(self._jets(x).evaluate_jet, self.weighted, explain=self.explain)
@@ -212,8 +212,8 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of signed distance and gradient at k points `x` (k, 3) that
-        `normalise` returned, Eqs. (7)-(8) of the paper.
+        """Return the joint posterior of signed distance and gradient, Eqs. (7)-(8) of the paper. It
+        is at k points `x` (k, 3) that `normalise` returned.
 
         The result is normalised: one unit is `scale` [m]. `joint` does the same for points [m], but
         limits their number and refuses points outside the domain.
@@ -349,7 +349,7 @@ def combined_covariance(
 ) -> Float[Tensor, "b v v"]:
     """Return the covariance of weighted sums of distances, in squared normalised units.
 
-    `x` holds g groups of p normalised points in each of b entries, and `weights` those of m sums
+    `x` holds g groups of p normalised points in each of b entries. `weights` are those of m sums
     over each group's points. The result covers all v = g m sums of an entry.
     """
     b, g, p, _ = x.shape

@@ -111,9 +111,9 @@ def next_view(
     """Return the camera for a second view that would reduce the shape's standard deviation most.
 
     Candidates are cameras on a sphere around the object, placed relative to the camera that took
-    the cloud: if cloud and table are turned, the answer turns with them. A camera would see the points of the
-    estimated surface that face it and that no other part of the surface hides. The deviation after
-    a view is that of the posterior given these points.
+    the cloud. If cloud and table are turned, the answer turns with them. A camera would see the
+    points of the estimated surface that face it. No other part of the surface may hide them. The
+    deviation after a view is that of the posterior given these points.
 
     The search knows neither neighbours that hide the object nor an arm that carries the camera. A
     fit to both views may be better still: it also uses the object's second outline.
@@ -121,13 +121,13 @@ def next_view(
     Args:
         shape: the shape, from `fit_shape`.
         grasps: grasps of this shape, in its frame. The deviation is then the mean over the contacts
-            of the first 20 executable ones (`VIEW.grasps`), weighted by their predicted success.
-            None, or no executable grasp, means the mean over the surface.
+            of the first 20 executable ones (`VIEW.grasps`). It is weighted by their predicted
+            success. None, or no executable grasp, means the mean over the surface.
         table: the table's plane, or its height [m] along z; cameras are above it. None means the
             table of the grasps, if they have one. Without a table, cameras may be below the object.
         distance: distance [m] of the camera from the middle of the surface, at least 1.5 radii
             (`VIEW.near`) of the shape's domain. None means the mean distance of earlier cameras, or
-            0.5 m (`VIEW.far`) if none is known, but at least the least distance.
+            0.5 m (`VIEW.far`) if none is known. It is at least the least distance.
 
     Raises `BadArgument` for a distance below the least one, and for grasps whose contacts all lie
     outside the shape's domain.

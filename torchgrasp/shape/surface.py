@@ -204,7 +204,7 @@ def _trace_wall(
         raise BadArgument(
             "shape", "a mean that is nowhere zero", "a shape with a surface inside its domain"
         )
-    # Cells that touch the outside of the ball are left out by the mask, so no wall is built along
+    # Cells that touch the outside of the ball are left out by the mask. So no wall is built along
     # its boundary.
     corners, faces, _, _ = marching_cubes(
         np.nan_to_num(volume, nan=1.0),
@@ -247,7 +247,7 @@ def _grid(
     """Return the mean signed distance at the nodes of a cubic grid, which starts at -radius; NaN
     outside the ball.
 
-    Every node of a block is evaluated if the surface may cross the block; other nodes copy a node
+    Every node of a block is evaluated if the surface may cross the block. Other nodes copy a node
     of a coarser grid.
     """
     line = -radius + step * torch.arange(cells + 1, dtype=torch.float64, device=shape.x.device)

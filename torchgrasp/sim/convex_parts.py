@@ -29,12 +29,12 @@ class CutNumbers:
     """Parameters of the cut of a mesh into convex parts."""
 
     thresholds: tuple[float, ...] = (0.05, 0.02, 0.01)
-    """Concavities of a part below which CoACD cuts no further (no unit): the first at which the
-    parts do not bulge, or else the last.
+    """Concavities of a part below which CoACD cuts no further (no unit). The first is taken at
+    which the parts do not bulge, or else the last.
     """
     bulge: float = 1e-3
-    """Greatest distance [m] of the parts' surface outside the mesh: `TrialSpec.overlap`, the depth
-    at which a hand may start in the parts.
+    """Greatest distance [m] of the parts' surface outside the mesh. It is `TrialSpec.overlap`, the
+    depth at which a hand may start in the parts.
     """
     within: float = 0.95
     """Share of the parts' surface that must be within this distance."""
@@ -203,8 +203,8 @@ def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
 
 
 def _fingerprint(mesh: "trimesh.Trimesh") -> str:
-    """Return the cache's key for a mesh: a SHA-256 of the mesh and of the settings with which it is
-    cut.
+    """Return the cache's key for a mesh. It is a SHA-256 of the mesh and of the settings with which
+    it is cut.
     """
     digest = hashlib.sha256(f"coacd {dataclasses.astuple(CUT)} {sorted(_SEARCH.items())}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
@@ -223,7 +223,7 @@ def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
 
 
 def _load(path: Path, mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
-    """Read the parts of a cache file as hulls of their vertices; raise an error for vertices far
+    """Read the parts of a cache file as hulls of their vertices. Raise an error for vertices far
     outside the mesh.
     """
     from scipy.spatial import QhullError

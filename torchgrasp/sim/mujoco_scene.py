@@ -22,8 +22,8 @@ NEIGHBOUR = "torchgrasp_neighbour_{}"
 class MujocoScene(SimulatedScene):
     """A simulated scene in MuJoCo: table, object and hand.
 
-    A step runs the second half of MuJoCo's step (forces to state) before its first half (state to
-    poses and contacts). So poses are current between steps.
+    A step runs the second half of MuJoCo's step (forces to state). Then it runs the first half
+    (state to poses and contacts). So poses are current between steps.
     """
 
     def __init__(self, spec: SceneSpec) -> None:

@@ -1,5 +1,5 @@
-"""The contents of a scene in SAPIEN: the world, the table, bodies of convex parts, and the hand on
-its mount.
+"""The contents of a scene in SAPIEN. They are the world, the table, bodies of convex parts, and the
+hand on its mount.
 
 Settings that differ from SAPIEN's defaults:
 
@@ -12,7 +12,7 @@ Settings that differ from SAPIEN's defaults:
 * Penetrations are resolved at 1 m/s at most.
 * The solver is PGS: with TGS a held object creeps, far inside the friction cones. Only TGS knows
   contact patches; with 32 iterations a step the object creeps slower than with 10.
-* Convex parts are cooked at a larger scale, and the foot of a finely faceted part is a shape of its
+* Convex parts are cooked at a larger scale. The foot of a finely faceted part is a shape of its
   own.
 
 A `material` is PhysX's material of a surface, with its friction.

@@ -118,7 +118,7 @@ class SapienScene(SimulatedScene):
 
         The first three are the impulse [N s] on the body that the hand touches. The others are size
         times position (3,) [N s m], and size. Points without an impulse are left out. `sign` is 1
-        if the hand's link is the contact's first body, else -1: SAPIEN reports the impulse on the
+        if the hand's link is the contact's first body, else -1. SAPIEN reports the impulse on the
         first body.
         """
         for point in contact.points:

@@ -125,7 +125,7 @@ class SceneSpec:
         patch: radius [m] of a fingertip's contact patch. Torsional friction is friction x force x
             patch.
         height: height [m] of the table; None means the lowest point of the mesh.
-        edge: (x, y, offset) of a table that ends: it fills the points below its height whose
+        edge: (x, y, offset) of a table that ends. It fills the points below its height whose
             coordinate [m] along the horizontal unit vector (x, y) is less than the offset [m]. None
             means that the table does not end.
         neighbours: other bodies on the table, each a `Body`.

@@ -71,9 +71,9 @@ class SimulatedHand:
         sent: targets (j,) [rad or m] of the last tick, in the order of `scene.joint_names`.
         first_touch: timestep (f,) of each fingertip's first contact with the object; infinite
             before it.
-        first_stray: timestep (3,) of the hand's first unintended contact: with a neighbour; with
-            the table; with the object, of a link that neither is nor carries a fingertip. Infinite
-            before it.
+        first_stray: timestep (3,) of the hand's first unintended contact. The entries are for a
+            neighbour, for the table, and for the object. The last is of a link that neither is nor
+            carries a fingertip. Infinite before it.
         stray: sums of the impulses (3,) [N s] of these contacts.
         most_stray: largest force (3,) [N] of these contacts, averaged over a tick.
         period: time [s] of a control tick.

@@ -54,7 +54,7 @@ class SimulatedScene(abc.ABC):
 
     Arrays are in the world's frame. The hand is carried by a mount, a chain of prismatic joints
     (`SceneSpec.slides`), each with a motor. The j driven joints are all movable joints of the
-    hand's URDF. f counts the fingertips, in the order of the grasp's contacts.
+    hand's URDF. Here f counts the fingertips, in the order of the grasp's contacts.
 
     Attributes:
         joint_names: names of the j driven joints, in the order of every array of joints.
@@ -150,7 +150,7 @@ class SimulatedScene(abc.ABC):
         may be left out.
 
         The numbers are normal impulse (3,) [N s], place times size (3,) [N s m], size, and force
-        (3,) [N] if known: on the second body, or on the first if the `sign` is -1.
+        (3,) [N] if known. They are on the second body, or on the first if the `sign` is -1.
         """
 
     @abc.abstractmethod

@@ -1,5 +1,5 @@
-"""Predicted success: features that decide whether a grasp holds its task, a model that predicts it,
-and the order of grasps.
+"""Predicted success: features that decide whether a grasp holds its task. Also a model that
+predicts it, and the order of grasps.
 """
 
 from torchgrasp.success.reasons import Cost

@@ -44,13 +44,14 @@ CAUSES: dict[str, dict[str, str]] = {
 """The features of a grasp with their units, by the cause of failure that they describe.
 
 * "load": the normal force of the strongest finger that the load needs; the logarithm of the
-  fingers' strength over it; the distance of the contacts' centroid from the object's centre.
+  fingers' strength over it. Last is the distance of the contacts' centroid from the object's
+  centre.
 * "moved": two such logarithms, and whether the force is enough, as means over displacements of the
   object (`touch_moved`).
 * "surface": the greatest standard deviations of the surface and of its normal at a contact.
 * "object": `size`, `height` and `breadth` of `EstimatedBody`.
 * "task": the friction coefficient; the mass; the normal force of the strongest finger, 0 if the
-  hand presses as the load needs; then 1 if true, else 0: the object is lifted; it may be
+  hand presses as the load needs. The others are 1 if true, else 0: the object is lifted; it may be
   displaced; the hand closes in open loop.
 """
 # All features, in the order of the columns.
@@ -78,8 +79,8 @@ class FeatureNumbers:
 
 MEASURES = FeatureNumbers()
 UNCARRIED = 2.1
-"""Decrease of a lift's log-odds of success if not even the greatest finger forces carry the weight:
-of a logistic regression on the model's log-odds and this, in trials of authored bodies.
+"""Decrease of a lift's log-odds of success if not even the greatest finger forces carry the weight.
+It is from a logistic regression on the model's log-odds and this, in trials of authored bodies.
 """
 
 

@@ -1,5 +1,5 @@
-"""How a grasp carries a load: the forces that it needs, the load's lever arm, and the strength of
-the fingers.
+"""How a grasp carries a load: the forces that it needs, and the load's lever arm. Also the strength
+of the fingers.
 """
 
 import dataclasses
@@ -42,8 +42,8 @@ def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> 
     """Return the lever arm (no unit) of a load at `center` [m] on each set of f contact `points`
     [m].
 
-    It is the distance of `center` from the longest side of the contacts' triangle, divided by the
-    triangle's height over this side plus `LOADS.torsion`. About this side the object turns most
+    It is the distance of `center` from the longest side of the contacts' triangle. It is divided by
+    the triangle's height over this side plus `LOADS.torsion`. About this side the object turns most
     easily. For more than three contacts, the triangle with the smallest result counts. `center` is
     one point (3,), or one for each set (b, 3).
     """
@@ -104,7 +104,7 @@ def carrying_force(
 def greatest_force(
     hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> Float[Tensor, "g"]:
-    """Return the largest factor (no unit) on the `forces` [N] of each of g grasps at which no drive
+    """Return the largest factor (no unit) on the `forces` [N] of each of g grasps. At it no drive
     exceeds its greatest torque.
 
     The forces at the contacts are in the frame of the grasps. Those that are NaN give NaN.

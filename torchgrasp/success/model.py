@@ -1,5 +1,5 @@
-"""The model of success: boosted trees that predict a grasp's log-odds of success, with the results
-of trials that calibrate it.
+"""The model of success: boosted trees that predict a grasp's log-odds of success. Results of trials
+calibrate it.
 
 `scripts/train.py success` fits the model to trials of authored bodies. Trials of other families
 calibrate it. Promises rest on these families, and on those of scanned and printed objects

@@ -51,7 +51,7 @@ class MovedContacts(NamedTuple):
     """Contact sets of g grasps after each of d displacements of the object.
 
     Args:
-        contacts: contact points [m] and outward normals in the object's frame, f for each set; the
+        contacts: contact points [m] and outward normals in the object's frame, f for each set. The
             d g sets are ordered by displacement, then by grasp.
         forces: balanced contact forces [N] of these sets, of which the largest normal force is 1 N;
             NaN if there are none.
@@ -70,8 +70,8 @@ def touch_moved(
 
     The displacements, at most `MOVED.radius`, fill a ball evenly, in the axes of the hand. The
     contacts are in the frame of the object, as `field`. Each fingertip moves along the line from
-    its pre-grasp to its planned pose, and further, until it touches the surface that `field` gives.
-    The balanced `forces` [N] at the planned contacts say in which ratios the fingers push.
+    its pre-grasp to its planned pose. It goes further, until it touches the surface that `field`
+    gives. The balanced `forces` [N] at the planned contacts say in which ratios the fingers push.
     """
     count = MOVED.count
     numbers = torch.arange(count, dtype=torch.float64, device="cpu")
@@ -99,9 +99,9 @@ def trace(
     """Return for each moving ball the surface point [m] that it first touches, the normal there,
     and whether it touches.
 
-    The balls belong to d displacements, g grasps and f fingertips; all tensors but `radius` have
+    The balls belong to d displacements, g grasps and f fingertips. All tensors but `radius` have
     the shape (d, g, f, 3), and the mask (d, g, f). Ball f, of a `radius` [m], starts with its
-    centre at `start` [m] and moves along the unit vector `way`, at most `MOVED.length`. `field`
+    centre at `start` [m]. It moves along the unit vector `way`, at most `MOVED.length`. `field`
     gives the signed distance [m] from the surface; the normals are outward unit vectors. A ball
     that does not touch has the surface point nearest to its end. This is sphere tracing: a ball
     moves on by its distance from the surface.

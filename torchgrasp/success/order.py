@@ -1,5 +1,5 @@
-"""The order of grasps: by predicted success for a task, or by the variance at the contacts as in
-the paper.
+"""The order of grasps by predicted success for a task. Or the order by the variance at the
+contacts, as in the paper.
 """
 
 import dataclasses
@@ -23,8 +23,8 @@ DOMAIN = ("deviation", "size", "height", "friction", "mass", "force")
 unknown.
 """
 UNKNOWN = 0.1
-"""Largest probability of a friction or mass outside of the trials at which success counts as known:
-more would break the promise that 0.9 of the grasps hold.
+"""Largest probability of a friction or mass outside of the trials at which success counts as known.
+More would break the promise that 0.9 of the grasps hold.
 """
 
 
@@ -70,10 +70,10 @@ def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], covered: Float[Tensor, "
     """Return grasps whose k executable ones have a new score, interval and `known`.
 
     The score is `log_odds`. `covered` is the probability of conditions that trials support. Of the
-    rest nothing is known: the interval is that of the success model times `covered`, and its upper
-    end is greater by the rest. A grasp is known if the rest is at most `UNKNOWN`; otherwise its
-    interval is [0, 1]. Failed grasps keep their score; their interval is [0, 0], and they count as
-    known.
+    rest nothing is known. So the interval is that of the success model times `covered`, and its
+    upper end is greater by the rest. A grasp is known if the rest is at most `UNKNOWN`; otherwise
+    its interval is [0, 1]. Failed grasps keep their score; their interval is [0, 0], and they count
+    as known.
     """
     known = covered >= 1 - UNKNOWN
     good = flatnonzero(grasps.status == Status.OK)
@@ -114,8 +114,8 @@ def by_success(grasps: Grasps, *groups: Int[Tensor, "g"]) -> Grasps:
 
     Executable grasps with a known success come first, then other executable ones, then failed ones.
     Within each of these the score falls; between equal scores, the greater margin of the
-    certificate comes first. With an arm, grasps of equal success in whole per cent are sorted by
-    falling product of the numbers in `ease`.
+    certificate comes first. With an arm, grasps of equal success in whole per cent are sorted
+    further. They are in falling order of the product of the numbers in `ease`.
     """
     late = 2 * (grasps.status != Status.OK).int()
     late = late if grasps.known is None else late + (~grasps.known & (late == 0)).int()

@@ -1,11 +1,11 @@
-"""A promise: of the grasps that are returned, at least a given share holds, on objects of families
-that nobody tried.
+"""A promise: of the grasps that are returned, at least a given share holds. It is for objects of
+families that nobody tried.
 
 Grasps are returned whose log-odds of success are at least a bound. Families of bodies and objects
-that the model was not fitted on choose the bound, by conformal risk control (Angelopoulos et al., 2024). Let
-l_f be the mean of 1[returned] (1[failed] - alpha) over the trials of family f, with alpha = 1 -
-promise. Returned grasps fail more often than promised if and only if E l > 0. A new family has a
-loss of at most 1 - alpha. So the least bound is taken at which
+that the model was not fitted on choose the bound. The method is conformal risk control
+(Angelopoulos et al., 2024). Let l_f be the mean of 1[returned] (1[failed] - alpha) over the trials
+of family f, with alpha = 1 - promise. Returned grasps fail more often than promised if and only if
+E l > 0. A new family has a loss of at most 1 - alpha. So the least bound is taken at which
 
     sum_f l_f + (1 - alpha) <= 0.
 
@@ -39,8 +39,8 @@ class Promise(NamedTuple):
 
 @functools.cache
 def find_promise(share: float) -> Promise | None:
-    """Return the promise that a `share` of the returned grasps, in [0, 1], holds; None if the
-    trials support no bound.
+    """Return the promise that a `share` of the returned grasps, in [0, 1], holds. Return None if
+    the trials support no bound.
     """
     log_odds, held, family = load_success_model().kept.unbind(1)
     least = least_log_odds(log_odds, held > 0, family.long(), share)
@@ -66,8 +66,8 @@ def least_log_odds(
     None means that the trials support no bound. `share` is in [0, 1], and the module says how the
     bound is chosen.
 
-    Each of the r trials has predicted `log_odds`, `held` (whether the grasp held), and the number
-    of its `family` of bodies.
+    Each of the r trials has predicted `log_odds`, and `held` (whether the grasp held). It has the
+    number of its `family` of bodies.
     """
     if not len(log_odds):
         return None

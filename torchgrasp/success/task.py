@@ -30,14 +30,14 @@ class GraspTask(Value):
         mass: mass [kg] of the object, 0.001 to 10, or its `Distribution`.
         force: normal force [N] of the strongest finger. None means 4 N in pulls. In a lift it means
             as much as the felt load needs.
-        lift: True means that the object is lifted off its table. False means pulls: the object
+        lift: True means that the object is lifted off its table. False means pulls. The object
             floats, and is pulled along six directions with a force of 10 m/s^2 times its mass. None
             means a lift if the planner knows the table and the closing is not "open_loop".
         closing: how the hand closes.
             "uncertainty": by touch.
             "open_loop": without sensors, from pre-grasp to grasp to squeeze.
-        displaced: whether the object may be elsewhere than the camera saw it: up to 30 mm along the
-            table, or 5 mm and 5 degrees in pulls.
+        displaced: whether the object may be elsewhere than the camera saw it. This is up to 30 mm
+            along the table, or 5 mm and 5 degrees in pulls.
 
     Raises `BadArgument` for a number outside its range, or a lift in open loop.
 
@@ -74,7 +74,7 @@ class GraspTask(Value):
         (`ClosureResult.mass`).
 
         `result` is what `close_hand` returned. Masses outside those that it shows are left out. If
-        none is left, the mass is what it shows. The task is returned as it is in two cases: the
+        none is left, the mass is what it shows. The task is returned as it is in two cases. The
         lift showed no mass, or its status is neither `OK` nor `TOO_HEAVY`.
         """
         felt = result.mass
@@ -113,7 +113,7 @@ class ConditionNumbers:
     """Numbers of frictions and masses that stand for their distributions."""
 
     one: int = 9
-    """Number of frictions, or of masses if the friction is certain: success falls by steps, of
+    """Number of frictions, or of masses if the friction is certain. Success falls by steps, of
     which a mean over 9 misses at most 1/18.
     """
     both: int = 3
@@ -163,8 +163,8 @@ class TaskWrenches(Value):
     The contacts must balance each load alone.
 
     Args:
-        wrenches: loads (w, 6) on the object in the cloud's frame: first the force [N], in which its
-            weight is included, then the torque [N m] about `point`.
+        wrenches: loads (w, 6) on the object in the cloud's frame. First is the force [N], in which
+            its weight is included, then the torque [N m] about `point`.
         point: point (3,) [m] in the cloud's frame; None means the estimated centre of the object.
 
     Raises `BadArgument` for no load, or a load that is all zeros.
@@ -195,7 +195,7 @@ class TaskNumbers:
     push: float = 2.5
     """Force [N] of a push."""
     around: float = 1.24
-    """Length (no unit) of vectors along the diagonals and axes of a cube, 14 directions: their
+    """Length (no unit) of vectors along the diagonals and axes of a cube, 14 directions. Their
     convex hull contains the unit ball.
     """
     upward: float = 1.2

@@ -5,8 +5,8 @@ A value is a frozen dataclass of tensors: it never changes, and `.to()` returns 
 are in metres, angles in radians. Positions are in the frame of the cloud ("obj") unless stated
 otherwise. `a_from_b` is a rigid transform (4, 4) [m] that maps coordinates of frame b into a.
 
-Letters in shapes: n points, b batch rows, g grasps, f fingertips (three to five), e friction-cone
-edges, h actuated joints, t time steps.
+Letters in shapes: n points, b batch rows, g grasps, f fingertips (three to five). Also e
+friction-cone edges, h actuated joints, and t time steps.
 """
 
 import copy
@@ -40,8 +40,8 @@ class PointCloud(Value):
         viewpoint: position of the camera (3,) [m], or of each point's camera (n, 3) [m]; None if it
             is unknown.
         frustum: inward unit normals (4, 3) of the left, right, top and bottom side of the camera's
-            view, or those (n, 4, 3) of each point's camera. An object that reaches a side is cut
-            off there. None if they are unknown.
+            view. With several views, those (n, 4, 3) of each point's camera. An object that reaches
+            a side is cut off there. None if they are unknown.
         pose_error: standard deviation (n,) [m] of an error of the camera's pose, which moves all
             points of a view together. None if the poses are exact.
 
@@ -207,8 +207,8 @@ class Contacts(Batch):
 class ContactPlan(Batch):
     """Planned contact sets, one for each initial guess, in the order of the guesses.
 
-    `plan_contacts` makes it. b counts contact sets, f the fingertips of a set, and e the edges of a
-    friction cone (`ContactSpec.edges`).
+    `plan_contacts` makes it. Here b counts contact sets, f the fingertips of a set, and e the edges
+    of a friction cone (`ContactSpec.edges`).
 
     Attributes:
         contacts: the contact sets, also those that violate a constraint.
@@ -232,8 +232,8 @@ class Certificate(Batch):
     proof.
 
     `certify` returns it, and `closed` is the answer. f counts the fingertips of a set. The wrenches
-    w of a set are the columns of W: forces along the edges of its friction cones, then their
-    torques. Torques are about the contacts' centroid. They are divided by the contacts'
+    w of a set are the columns of W. They are forces along the edges of its friction cones, then
+    their torques. Torques are about the contacts' centroid. They are divided by the contacts'
     root-mean-square distance from it, so wrenches have no unit.
 
     Attributes:
@@ -241,18 +241,18 @@ class Certificate(Batch):
             their `rank_ratio` at least 1e-3: coincident or collinear contacts satisfy Eq. (13),
             too.
         margin: the largest s (b,) for which coefficients phi >= s have W phi = 0 and sum phi = 1.
-            -inf if no coefficients balance; NaN for contacts that are not finite.
+            It is -inf if no coefficients balance, and NaN for contacts that are not finite.
         rank_ratio: the smallest singular value of W over its largest one (b,).
         residual: the largest component |W phi| (b,) of the balance found; infinite if there is
             none.
         witness: a unit wrench v (b, 6). If the margin is at most 0 or -inf, v . w >= 0 for every
-            edge wrench w, up to rounding: no contact force opposes v. For a closed set, v proves
+            edge wrench w, up to rounding. So no contact force opposes v. For a closed set, v proves
             that no greater margin is possible. The margin is -min(v . w) / sum(v . w - min(v . w))
             over the edge wrenches. If only the rank is too low, the wrenches are smallest along v.
         task_load: the load t (b, 6) that the contacts resist least, of the loads in the argument
             `resist` of `plan_grasps`. It is a force [N], then a torque [N m] about the contacts'
             centroid, in the frame of the cloud.
-        task_margin: the greatest multiple (b,) of t that the contacts resist, without unit; all
+        task_margin: the greatest multiple (b,) of t that the contacts resist, without unit. All
             loads are resisted if it is at least 1.
         task_forces: contact forces (b, f, 3) [N] that balance this multiple of t, in the frame of
             the cloud.
@@ -284,13 +284,13 @@ class ContactCode(Value):
     three contacts to three fingers.
 
     Attributes:
-        q: code (b, 6, 6) of each set in each assignment: first 3 distances [m] of the contacts from
-            their centroid, then 3 cosines between their normals.
+        q: code (b, 6, 6) of each set in each assignment. First are 3 distances [m] of the contacts
+            from their centroid, then 3 cosines between their normals.
         obj_from_vf: pose (b, 6, 4, 4) [m] of the virtual frame (Eqs. 15-17) in the frame of the
-            contacts. Its origin is their centroid. x points from the contact of the first finger to
-            that of the third. z is normal to the plane of the contacts.
+            contacts. Its origin is their centroid. The axis x points from the contact of the first
+            finger to that of the third. The axis z is normal to the plane of the contacts.
         status: `Status` code (b,) of each set. If the contacts of a set lie on a line or in a
-            point, it is not `OK`, and `q` and `obj_from_vf` are NaN.
+            point, it is not `OK`. Then `q` and `obj_from_vf` are NaN.
         permutation: indices (6, 3): in assignment k finger i touches contact `permutation[k, i]`.
     """
 
@@ -355,7 +355,7 @@ class Grasps(Batch):
     """Grasps: hand configurations with their contacts, certificates and checks, the best grasp
     first.
 
-    `plan_grasps` returns them, and `load_grasps` reads them from a file. g counts grasps, f
+    `plan_grasps` returns them, and `load_grasps` reads them from a file. Here g counts grasps, f
     fingertips, h actuated joints of the hand, and n joints of the arm. Positions and directions are
     in the frame of the cloud. Joints that slide have [m] in place of [rad].
 
@@ -371,7 +371,7 @@ class Grasps(Batch):
             contact set of grasp k.
         tip_error: distance (g, f) [m] of each fingertip from its contact.
         clearance: least distance (g,) [m] of the links from the estimated surface, from each other
-            and from the table; negative where they overlap. Fingertips may touch the surface.
+            and from the table. It is negative where they overlap. Fingertips may touch the surface.
         normal_angle: angle (g, f) [rad] between the axis of a fingertip's pad and the inward normal
             of the object at its contact.
         certificate: proof of force closure (g rows).
@@ -380,11 +380,11 @@ class Grasps(Batch):
             another number, which says nothing of success.
         status: `Status` code (g,): `OK` for an executable grasp, else the reason why it failed.
         meta: names, units, hashes and the seed of the plan, as text.
-        known: mask (g,) of the grasps like those of the trials to which the success model was
-            fitted; the success of others is unknown. None means that all are known.
-        interval: 95 % confidence interval (g, 2) of the share of grasps with this predicted success
-            that held in trials, over families of objects. [0, 1] if the success is unknown, [0, 0]
-            for failed grasps. None if there are no bounds.
+        known: mask (g,) of the grasps that are like those of the trials to which the success model
+            was fitted. The success of other grasps is unknown. None means that all are known.
+        interval: 95 % confidence interval (g, 2), over families of objects. It is of the share of
+            grasps with this predicted success that held in trials. [0, 1] if the success is
+            unknown, [0, 0] for failed grasps. None if there are no bounds.
         arm: joints (g, n) [rad or m] of the arm at the grasp; None without an arm.
         ease: two numbers (g, 2) of the arm's straight way to the grasp (`torchgrasp.arm`). First
             the least distance of a joint from its limits, over half its range. Then the least
@@ -461,8 +461,8 @@ class Grasps(Batch):
         return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 
     def show(self, cloud: Any = None, hand: Any = None) -> Any:
-        """Return a sheet of the best grasps: a table of up to five executable ones, and a picture
-        of the first.
+        """Return a sheet of the best grasps. It has a table of up to five executable ones, and a
+        picture of the first.
 
         A notebook shows both, and `print` shows the table. The attribute `picture` of the sheet
         holds the picture as PNG; it is None if no grasp is executable.

@@ -163,8 +163,8 @@ class ContactSpec(Value):
         Fingertips are balls of radius r, the `fingertip_radius`. With a `flat_radius` they must
         touch a flat side, and the least height is r + `flat_radius`. With None they may touch the
         object's rounded upper rim, and the least height is (r + q)(1 - s). Here q is the rim's
-        radius, 3 mm, the least of `FLAT_RADII`. s is the largest vertical part of the contact's
-        unit normal that `mean_friction` allows.
+        radius, 3 mm, the least of `FLAT_RADII`. The number s is the largest vertical part of the
+        contact's unit normal that `mean_friction` allows.
         """
         if self.flat_radius is not None:
             return self.fingertip_radius + self.flat_radius
@@ -194,15 +194,15 @@ class ContactSpec(Value):
     def relaxed(self, below: Length, radius: Length) -> "Iterator[ContactSpec]":
         """Yield weaker constraints for an object without grasps, the strictest first.
 
-        First come specs with a smaller `flat_radius`: each of 8, 6, 4 and 3 mm (`FLAT_RADII`) that
-        is less than `below`.
+        First come specs with a smaller `flat_radius`. It is each of 8, 6, 4 and 3 mm (`FLAT_RADII`)
+        that is less than `below`.
 
-        With a table, three specs follow for the upper rim of a low object, with a `flat_radius` of
-        1 mm (`RIM`). There a fingertip on the table touches an inclined surface. The estimated rim
-        is too round, so its normals are too steep. Therefore the second and the third spec give up
-        half and all of two margins. One is that of the friction: `planned_friction` rises to
-        `mean_friction`. The other is that of a `tip_radius` of None: it falls from at least 12 mm
-        (`TIP_RADIUS`) to `radius`.
+        With a table, three specs follow for the upper rim of a low object. They have a
+        `flat_radius` of 1 mm (`RIM`). There a fingertip on the table touches an inclined surface.
+        The estimated rim is too round, so its normals are too steep. Therefore the second and the
+        third spec give up half and all of two margins. One is that of the friction:
+        `planned_friction` rises to `mean_friction`. The other is that of a `tip_radius` of None: it
+        falls from at least 12 mm (`TIP_RADIUS`) to `radius`.
 
         There are no specs if `flatness` is None, or if `flat_radius` is not None.
 
@@ -278,8 +278,8 @@ Mode = Literal["joint", "contact_first", "paper"]
 * "joint": the hand starts from random postures near each contact set. If none succeeds, the
   contacts move along the surface with the hand.
 * "contact_first": initial postures of the learned model are refined onto fixed contacts.
-* "paper": the paper's method (docs/paper.md): initial postures of the model by Eqs. 21-24, refined
-  by COBYLA, and the paper's shape, contacts and ranking.
+* "paper": the paper's method (docs/paper.md). Initial postures are those of the model by Eqs.
+  21-24, refined by COBYLA. Shape, contacts and ranking are the paper's.
 """
 Ranking = Literal["success", "variance"]
 """Which grasp is the best: the one with the highest predicted success, or the least sum of
@@ -305,8 +305,8 @@ class TrialSpec(Value):
             "uncertainty": Eqs. 25-28 with the surface's calibrated standard deviations, and with
               `options`.
             "fixed": the same with equal gains for all contacts.
-            "paper": Eqs. 25-28 as written, with forces of a learned stability model, or analytic
-              ones if the hand's folder has no stability.safetensors.
+            "paper": Eqs. 25-28 as written, with forces of a learned stability model. They are
+              analytic if the hand's folder has no stability.safetensors.
             "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
             "position": PI control to goals behind the contacts.
             "open_loop": joint motion from pre-grasp to grasp to squeeze.
@@ -316,7 +316,7 @@ class TrialSpec(Value):
             "impedance": virtual springs keep the fingertips together and in place.
             "position": joint targets are kept.
             "law": Eq. 25 continues.
-            None means "grip", or "force" in three cases: `force` is given, the closing is not
+            None means "grip", or "force" in three cases. `force` is given, the closing is not
               "uncertainty" or "fixed", or a fingertip has no working tactile sensor.
         mass: mass [kg] of the object, 0.001 to 10. From a `Distribution` each trial draws it by its
             seed.
@@ -409,7 +409,7 @@ class TrialSpec(Value):
     def pressing(self) -> HoldingMode:
         """The holding mode of the trial, such as "grip".
 
-        This is the field `holding`. If that is None, it is "force" in three cases: `force` is
+        This is the field `holding`. If that is None, it is "force" in three cases. `force` is
         given, `closing` is not "uncertainty" or "fixed", or a fingertip has no working tactile
         sensor. Otherwise it is "grip". After the closing "open_loop" the mode is not used: the
         squeeze is kept.
@@ -443,8 +443,8 @@ class TrialSpec(Value):
 def default_holding(sensor: SensorModel, closing: ClosingMode) -> HoldingMode:
     """Return the default holding mode, "grip" or "force", for the sensors and a closing mode.
 
-    It is "grip" if the `sensor` is tactile at all fingers, none is dead, and the closing is
-    "uncertainty" or "fixed".
+    It is "grip" if the `sensor` is tactile at all fingers and none is dead. The closing must also
+    be "uncertainty" or "fixed".
     """
     return "grip" if sensor.full and closing in ("fixed", "uncertainty") else "force"
 

@@ -48,8 +48,9 @@ LIMIT = 600.0
 
 
 class Outcome(NamedTuple):
-    """What came of one body: where it was grasped ("edge" or "table"), and the number of tries that
-    raised it (0 for none). The same follows for grasps where it lies, and why it was lost.
+    """What came of one body. First where it was grasped ("edge" or "table"), and the number of
+    tries that raised it (0 for none). The same follows for grasps where it lies, and why it was
+    lost.
     """
 
     where: str

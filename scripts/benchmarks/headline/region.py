@@ -1,8 +1,8 @@
 """What it costs to be told where to hold. The best grasp of a free plan stands beside the best one
 with all contacts in a region.
 
-The region is chosen from the cloud before planning. It is the upper half of the cloud's bounding
-box for every second object, and for the others the half of its longer horizontal side with fewer
+The region is chosen from the cloud before planning. For every second object it is the upper half of
+the cloud's bounding box. For the others it is the half of its longer horizontal side with fewer
 points, as a handle or a neck has. Both reach over the unseen depth. The objects lie where they were
 seen. An object without a grasp fails.
 """
@@ -124,8 +124,8 @@ def _compare(
 
 
 def choose_half(cloud: PointCloud, upper: bool) -> Region:
-    """Return the upper half of a cloud's bounding box over its table, or the half of its length
-    with fewer points.
+    """Return the upper half of a cloud's bounding box over its table, or half of its length with
+    fewer points.
     """
     if upper:
         return half_of(cloud, 2, far=True)

@@ -66,8 +66,9 @@ class DraftNumbers:
     most_stiffness: float = 10.0  # greatest stiffness of a drive [N m/rad]
     damping: float = 0.03  # least time constant [s]: the ratio of damping to stiffness
     trials: int = 1000  # random postures of each set of fingers in which a free one is sought
-    # If fewer than this share of them are free, pairs of links that meet in these shares or more
-    # are left out. Their shapes are too coarse. Real fingers do not meet themselves so often.
+    # Pairs of links are left out if fewer than this share of postures is free. They are pairs that
+    # meet in these shares or more. Their shapes are too coarse. Real fingers do not meet themselves
+    # so often.
     least_free: float = 0.02
     most_within: float = 0.25  # pairs of one finger
     most_between: float = 0.5  # other pairs

@@ -150,8 +150,8 @@ def _merge(
 
 
 def _marker(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Link | None:
-    """Return a link with shapes that is fixed, small, moved by a joint, and below which nothing
-    moves or has shapes; None if there is none.
+    """Return a small link with shapes that is fixed to its parent, and that a joint above moves.
+    Below it nothing moves or has shapes. Return None if there is none.
     """
     above = {j.child: j for j in urdf.joints}
     busy = {j.parent for j in urdf.movable} | {

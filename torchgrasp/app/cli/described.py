@@ -16,7 +16,7 @@ def locate_urdf(
 ) -> tuple[Path, Path | None, Path | None]:
     """Return the URDF or MJCF, the folder of its meshes, and the folder to write.
 
-    If `name` is a name of robot_descriptions, its files are used, and a folder of this name is
+    If `name` is a name of robot_descriptions, its files are used. Then a folder of this name is
     written, unless `meshes` or `out` is given. Otherwise the three arguments are returned as they
     are. Raises `BadArgument` for a name without either, or if the download fails; `MissingExtra`
     without the package.

@@ -72,12 +72,12 @@ class PaperClosing:
     control near them.
 
     It is d theta = J^-1 [(1 - lambda) K_P (x_d - x_c) + lambda C_F (f_d - f_c)]. Here theta are the
-    joints, and J is the fingertips' Jacobian. x and f are positions and forces of the
+    joints, and J is the fingertips' Jacobian. The letters x and f are positions and forces of the
     fingertips, desired (d) and sensed (c). The gains K_P and C_F are those of
     `ClosingReference.as_printed`. A damped inverse replaces J^-1; speed is bounded. No joint target
     is so far ahead of its joint that the drive would exceed its torque limit. The closing ends when
-    all fingers touch, the share of force control (lambda, Eq. 26) is at least 0.5 in each, and the
-    forces have been steady for `SETTLED` seconds.
+    all fingers touch, and two conditions hold. The share of force control (lambda, Eq. 26) is at
+    least 0.5 in each, and the forces have been steady for `SETTLED` seconds.
     """
 
     palm = STILL
@@ -172,8 +172,8 @@ class OpenLoopClosing:
     def advance(self, period: float) -> Float[Tensor, "*n j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later.
 
-        They are (j,) for one hand, or (n, j) if the attribute `poses` holds the postures (3, n, j)
-        [rad] of n hands: pre-grasp, grasp and squeeze.
+        They are (j,) for one hand. They are (n, j) if the attribute `poses` holds the postures (3,
+        n, j) [rad] of n hands: pre-grasp, grasp and squeeze.
         """
         self.time += period
         progress = min(self.time / POSE_TIME, 2.0)

@@ -68,7 +68,7 @@ class StabilityModel(Value):
     (`state_of`).
 
     `stable` is the density of stable grasps, `others` that of all others. `share` is the prior
-    probability of stable grasps, and `meta` holds texts on the hand, the bodies, trials, seed and
+    probability of stable grasps. `meta` holds texts on the hand, the bodies, trials, seed and
     scores.
     """
 

@@ -1,9 +1,9 @@
 """Bodies of revolution: their axis is the line that most surface normals meet.
 
-The lines along the normals of a surface of revolution meet its axis: they lie in a linear line
-complex of pitch 0 (Pottmann and Wallner, Computational Line Geometry, 2001). The distance by which
-a normal's line misses the axis is the moment of the normal about a point of the axis times the axis
-direction: it is linear in either factor.
+The lines along the normals of a surface of revolution meet its axis. They lie in a linear line
+complex of pitch 0 (Pottmann and Wallner, Computational Line Geometry, 2001). A normal's line misses
+the axis by a distance. It is the moment of the normal about a point of the axis times the axis
+direction, and linear in either factor.
 """
 
 import dataclasses
@@ -71,7 +71,7 @@ class RoundNumbers:
     miss: float = 0.2
     least_radius: float = 0.01
     """A normal meets the axis if the distance of its line is at most `miss` times the radius of the
-    point, or times `least_radius` [m] if that is greater.
+    point. If it is greater, `least_radius` [m] takes the place of this radius.
     """
     roundness: float = 0.055
     error: float = 0.0018
@@ -114,8 +114,8 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
 
     The transform is rigid [m], and its frame has the axis as z axis. The result is None if there is
     no such body. The axis is fitted to the probes of the scorer, which are points of the cloud. The
-    body, rotated about the axis, must stay out of the table and of the space that the cameras saw
-    to be empty.
+    body, rotated about the axis, must stay out of the table. It must also stay out of the space
+    that the cameras saw to be empty.
     """
     center, direction, cost = _fit_axis(*scorer.probes)
     if not cost < AXIS_FIT.cost:
@@ -211,8 +211,8 @@ def _round_body(
 
     Return None if the body is not round, has too few points, or shows only one flat side. Normals
     on the body meet the axis, and its points have the typical radius of their height. `allowed`
-    returns the RMS [m] by which normals may miss the axis, given the radius of each point and the
-    typical radius at its height.
+    returns the RMS [m] by which normals may miss the axis. It is given the radius of each point and
+    the typical radius at its height.
     """
     miss = lines.offset - lines.across @ center
     radius = norm(points[:, :2] - center)

@@ -1,5 +1,5 @@
-"""Completion of the hidden side of a view: by mirror images of the visible side, and of the bars of
-a frame by their width.
+"""Completion of the hidden side of a view. Mirror images of the visible side complete it, and the
+bars of a frame are completed by their width.
 """
 
 import dataclasses
@@ -87,8 +87,8 @@ class BarNumbers:
     thin: float = 0.012
     """Width [m] below which a part is a bar: that of a fingertip."""
     empty: float = 0.5
-    """Greatest distance of a frame's centre from the outline, inside of it, over the distance of
-    the centre from the cloud.
+    """Greatest distance of a frame's centre from the outline, inside of it. It is divided by the
+    distance of the centre from the cloud.
     """
     neighbours: int = 30
     """Number of neighbouring points that give width and direction, the same as for fitted
@@ -112,8 +112,8 @@ SomeHidden = TypeVar("SomeHidden", bound=Any)  # a batch with `points` [m]
 class Completion(Value):
     """Estimated m points of the hidden side, with their errors along the normals.
 
-    The errors have the covariance noise^2 I + D D^T [m^2], where I is the identity, D is
-    `deviations`, and the noise is that of `HiddenNumbers`.
+    The errors have the covariance noise^2 I + D D^T [m^2]. I is the identity, D is `deviations`,
+    and the noise is that of `HiddenNumbers`.
     """
 
     points: Float[Tensor, "m 3"]  # points on the hidden side [m]
@@ -159,12 +159,12 @@ def correlated_errors(
     shared: Float[Tensor, "m c"],
     local: Float[Tensor, "m"] | float,
 ) -> Float[Tensor, "m k"]:
-    """Return correlated errors [m] of m points [m], a column for each of k independent causes; the
+    """Return correlated errors [m] of m points [m], a column for each of k independent causes. The
     first c are those in `shared`.
 
     The `shared` errors [m] come first, then the modes of a smooth random field. The field's
-    variance at a point is the sum of the squares of the `local` error [m] and of the `shared`
-    errors there.
+    variance at a point is the sum of squares of errors there. They are the `local` error [m] and
+    the `shared` errors.
     """
     deviation = torch.sqrt(local**2 + (shared**2).sum(1))
     alike = torch.exp(-0.5 * (torch.cdist(points, points) / HIDDEN.part) ** 2)
@@ -183,8 +183,8 @@ def complete_cloud(
 
     The cloud is mirrored across its best planes and across pairs of them; images in better planes
     come first. A body of revolution and a part attached to it, such as a handle, are mirrored
-    separately, in the frame of the axis. `table` is the height [m] of a table with normal z, or
-    None. Raises `BadArgument` for a cloud without outward normals or viewpoints.
+    separately. This is done in the frame of the axis. `table` is the height [m] of a table with
+    normal z, or None. Raises `BadArgument` for a cloud without outward normals or viewpoints.
     """
     if cloud.normals is None or cloud.viewpoint is None:
         needed = "outward normals and viewpoints: see prepare_cloud"
@@ -291,8 +291,8 @@ class _Image(Batch):
 
 
 def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]:
-    """Split the cloud into a body of revolution and an attached part, such as a handle, or return
-    the whole cloud.
+    """Split the cloud into a body of revolution and an attached part, such as a handle. Otherwise
+    return the whole cloud.
     """
     if revolution is None:
         every = torch.arange(len(scorer.points), device="cpu")
@@ -363,8 +363,8 @@ def _mirror_in(
 
 
 def _is_frame(scorer: SymmetryScorer) -> bool:
-    """Return whether the middle of the cloud is empty: outside the outline or close to it, and
-    farther from the cloud than a bar is wide.
+    """Return whether the middle of the cloud is empty. Then it is outside the outline or close to
+    it, and farther from the cloud than a bar is wide.
     """
     middle = scorer.center
     away = float(torch.cdist(middle[None], scorer.points).amin())
@@ -424,8 +424,8 @@ def _hidden(
     points: Points,
     apart: float = HIDDEN.new,
 ) -> Bool[Tensor, "n"]:
-    """Return a mask of the points that are hidden in every view, not below the table, and farther
-    than `apart` [m] from the cloud.
+    """Return a mask of the points that are hidden in every view and not below the table. They are
+    farther than `apart` [m] from the cloud.
     """
     hidden = (scorer.nearest(points)[0] > apart) & scorer.outline.hides(points)
     if scorer.table is None:

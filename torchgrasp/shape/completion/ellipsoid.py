@@ -109,8 +109,8 @@ def find_ellipsoid(
 class _Fit:
     """The least-squares fit of an ellipsoid with 9 parameters.
 
-    They are its centre [m], and 6 entries of the logarithm of the symmetric matrix that maps the
-    unit ball to it.
+    They are its centre [m], and 6 entries of the logarithm of a symmetric matrix. This matrix maps
+    the unit ball to it.
     """
 
     points: np.ndarray

@@ -1,6 +1,6 @@
 """Silhouettes of views: the object lies within its outline and behind its visible surface.
 
-Lengths on the image plane at depth 1 have no unit: a point's position there is that in the image
+Lengths on the image plane at depth 1 have no unit. A point's position there is that in the image
 over the depth.
 """
 
@@ -30,7 +30,7 @@ class OutlineNumbers:
 
     grow: float = 2.0
     shrink: float = 1.65
-    """The outline is a union of discs of the radius `grow` about the pixels, then shrunk by
+    """The outline is a union of discs of the radius `grow` about the pixels. It is then shrunk by
     `shrink`, both in spacings.
     """
     neighbours: int = 5
@@ -88,7 +88,7 @@ def pick_apart(
     points: Float[Tensor, "n d"],
     count: int,
 ) -> Int[Tensor, "picks"]:
-    """Return the indices of at most `count` points that lie far apart; a rigid motion of all points
+    """Return the indices of at most `count` points that lie far apart. A rigid motion of all points
     does not change the choice.
     """
     return farthest_points(points, count, tie=TIE)
@@ -256,8 +256,9 @@ def silhouette(view: PointCloud) -> Silhouette:
     """Return the silhouette of one view [m], whose points must all lie in front of the camera.
 
     Within the outline there may be gaps, where nothing was measured. A gap counts as a hole (free
-    space) only if it is far wider than the surface around it, as in a frame of bars. Other gaps do
-    not count as free space: a mirror-like patch is not measured, and leaves a gap, too.
+    space) only if it is wide. It must be far wider than the surface around it, as in a frame of
+    bars. Other gaps do not count as free space: a mirror-like patch is not measured, and leaves a
+    gap, too.
     """
     assert view.viewpoint is not None
     axes, pixels, depths = (t.numpy() for t in _project(view.points, view.viewpoint))

@@ -1,4 +1,4 @@
-"""Mirror planes of a partial cloud: a mirror image must lie on the cloud or be hidden, not in free
+"""Mirror planes of a partial cloud. A mirror image must lie on the cloud or be hidden, not in free
 space.
 
 A plane n . x = o is given as (n, o), with a unit normal n and an offset o [m]. Its score is 1 if
@@ -73,12 +73,12 @@ class PlaneSearchNumbers:
     """
     hides: float = 0.35
     facing: float = 0.7
-    """Absolute cosines between a plane's normal and the viewing direction: above the first, the
-    mirror images are on the hidden side; above the second, the plane faces the camera.
+    """Absolute cosines between a plane's normal and the viewing direction. Above the first, the
+    mirror images are on the hidden side. Above the second, the plane faces the camera.
     """
     rim_prior: float = 0.15
     rim_distance: float = 0.25
-    """Score that a plane loses, and the distance from the rim, over the size, at which it does: a
+    """Score that a plane loses, and the distance from the rim, over the size, at which it does. A
     view ends near the plane.
     """
     square: float = 0.1
@@ -234,7 +234,7 @@ def find_planes(
     scores.
 
     On a table, the search tries only vertical planes. A plane perpendicular to the best one is
-    added if none was found near it: its mirror images are hidden, so that the cloud cannot confirm
+    added if none was found near it. Its mirror images are hidden, so that the cloud cannot confirm
     it. A horizontal plane at half the height is added to give the underside. A body of revolution
     (`turned`) needs neither, because every plane through its axis matches.
     """
@@ -317,7 +317,7 @@ def planes_near(
 ) -> Mirrors:
     """Return the planes near a plane (n, o [m]) for all combinations of t angles and s shifts.
 
-    The plane is rotated by `angles` [rad], about z only if the scorer is upright, and shifted by
+    The plane is rotated by `angles` [rad], about z only if the scorer is upright. It is shifted by
     `shifts` [m] along its normal.
     """
     normal = plane[:3]

@@ -90,8 +90,8 @@ class WallNumbers:
     """Number of points that a seen floor must exceed."""
     floor_rings: tuple[tuple[float, int], ...] = ((0.0, 1), (0.4, 5), (0.75, 8))
     lid_rings: tuple[tuple[float, int], ...] = ((0.0, 1), (0.5, 6))
-    """Rings of points on an unseen floor and on a lid: the radius of each ring as a share of that
-    of the floor or lid, and its number of points.
+    """Rings of points on an unseen floor and on a lid. Each has its radius as a share of that of
+    the floor or lid, and its number of points.
     """
     turned: int = 80
     """Most points of a wall that are rotated about the axis."""
@@ -127,8 +127,8 @@ def find_vessel(
     """Return the open vessel that a cloud shows, or None if it shows no vessel.
 
     `points` (n, 3) [m] and outward unit `normals` (n, 3) are in a frame with z up. Normals of an
-    inner wall point to the axis. Both walls are fitted at once: the outer radius is a cubic
-    polynomial of the height, and the inner radius is less by the thickness over the length of the
+    inner wall point to the axis. Both walls are fitted at once. The outer radius is a cubic
+    polynomial of the height. The inner radius is less by the thickness over the length of the
     normal's horizontal part. Robust weights (Cauchy) ignore handles.
     """
     height = points[:, 2]
@@ -195,8 +195,8 @@ def find_vessel(
 class HiddenWall(Batch):
     """Estimated points of a wall that the camera did not see.
 
-    The columns of `shared` are errors along the normals [m] for one standard deviation of the axis
-    position (two columns), the wall's thickness and the floor's height.
+    The columns of `shared` are errors along the normals [m] for one standard deviation. It is that
+    of the axis position (two columns), the wall's thickness and the floor's height.
     """
 
     points: Float[Tensor, "m 3"]  # hidden points of the wall [m]
@@ -272,8 +272,8 @@ def _across(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
 
 
 def _turn(wall: HiddenWall, vessel: Vessel, numbers: WallNumbers) -> HiddenWall:
-    """Return some points of a wall, rotated about the axis by parts of a full circle, with the
-    errors of the axis position.
+    """Return some points of a wall, rotated about the axis by parts of a full circle. Return also
+    the errors of the axis position.
     """
     wall = wall[pick_apart(wall.points, numbers.turned)]
     turn = rotations_about_z(numbers.turns)  # (k, 3, 3)
