@@ -57,8 +57,8 @@ def table4(out: Path, starts: int = 1000, seed: int = 0) -> None:
     ours.
 
     "paper" plans the paper's problem (Eqs. 10-14, starts on a sphere of 0.1) on the paper's
-    observations of the partial cloud. "default" is what torchgrasp does by itself. Only certified
-    grasps count.
+    observations of a view. "default" is what torchgrasp does by itself. Only certified grasps
+    count.
 
     Args:
         out: folder of table4.json; it is made where it does not exist.

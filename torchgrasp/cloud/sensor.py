@@ -434,8 +434,8 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
 def _check_still(
     number: int, parts: str, off: Float[Tensor, "*b"], most: float, most_share: float
 ) -> None:
-    """Raise `BadArgument` if a frame differs from the others by more than `most` in too large a
-    share of its parts. Differences are shares of the depth; NaN is not measured.
+    """Raise `BadArgument` if a frame differs from the others by more than `most` in too many of its
+    parts. Differences are shares of the depth; NaN is not measured.
     """
     share = float((off > most).sum()) / max(1, int(torch.isfinite(off).sum()))
     if share > most_share:

@@ -98,8 +98,8 @@ def guess_viewpoint(
     directions above the support, the one that explains the points best is taken. The camera is
     placed along it, 4 radii of the cloud away. The direction `up` is above the support; the normal
     of a support in the points replaces it. Before this search, the origin is tried. It is returned
-    if the points lie in front of it along z and a camera there can have seen them. With an `up`
-    that is given and not only `assumed`, it is tried only for points below the origin.
+    if the points lie before it along z and a camera there can have seen them. With an `up` that is
+    given and not only `assumed`, it is tried only for points below the origin.
     """
     points, normals = _draw(points, normals)
     centre, radius = _enclose(points)

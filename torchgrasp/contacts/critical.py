@@ -1,8 +1,8 @@
 """The least friction at which contacts can balance, and the forces that need it.
 
-Forces f_i on the object have the normal parts a_i = -n_i . f_i, and the tangential parts t_i. n_i
-are the outward normals. G maps them to their total force and torque. The critical friction is the
-least mu for which
+Forces f_i on the object have the normal parts a_i = -n_i . f_i, and the tangential parts t_i. The
+vectors n_i are the outward normals. G maps them to their total force and torque. The critical
+friction is the least mu for which
 
     G f = 0,    sum a_i = number of contacts,    x_i = (mu a_i, t_i) in the cone |t_i| <= mu a_i
 
@@ -527,8 +527,9 @@ class _Cones(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """The equations of balances, for their derivatives. They hold the normals, the rows of G and of
-    the sum of normal forces (b, 7, f, 3), and the load that the forces balance.
+    """The equations of balances, for their derivatives. They hold the normals, the rows of G, and
+    the rows (b, 7, f, 3) of the sum of normal forces. They also hold the load that the forces
+    balance.
     """
 
     normals: Vectors
@@ -560,8 +561,8 @@ class _Equations(NamedTuple):
         """Return the Jacobian and the residual of the q = 7 f + 8 equations.
 
         The unknowns are forces, press, slide, friction, twist and scale. The equations are those of
-        balance and sum, of the multipliers by contact, of sum a_i s_i0, and of x_i o s_i. Of the
-        last, the first number comes first, then the others, by contact.
+        balance and sum, then those of the multipliers by contact. Then come sum a_i s_i0, and x_i o
+        s_i. Of the last, the first number comes first, then the others, by contact.
         """
         n = self.normals[..., None]  # (b, f, 3, 1)
         mu = at.friction[:, None, None, None]

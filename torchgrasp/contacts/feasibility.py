@@ -114,9 +114,10 @@ def flatness_constraint(
     """Return a linear model of how far the normals around each contact differ from the contact's
     normal.
 
-    A value is |n - n_k| less the chord of the angle `flatness` [rad]. n is the normal at a contact,
-    and n_k are those on a ring around it. It is multiplied by the ring's `radius`, and so is a
-    normalised length. `points` (b, f, 3) are the normalised contacts at which the model is built.
+    A value is |n - n_k| less the chord of the angle `flatness` [rad]. Here n is the normal at a
+    contact, and n_k are those on a ring around it. It is multiplied by the ring's `radius`, and so
+    is a normalised length. `points` (b, f, 3) are the normalised contacts at which the model is
+    built.
     """
     (first, _), *others = walls_at(shape, points)
     found = _wall_constraint(first, points, flatness, radius)

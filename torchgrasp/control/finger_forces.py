@@ -108,10 +108,10 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
 
     The targets solve J^T f = K (target - q). Here q are the joints of the grasp, f the forces,
     and J the Jacobian of the contacts. K is diagonal. Each actuated joint has the `kp` of its own
-    drive and of the joints coupled to it, times their squared ratios. If no forces that press at
-    every contact balance, each force is `force` along the inward normal. The targets are
-    differentiable in the joints of the grasps. The forces, found by a search, are not
-    differentiable in the contacts.
+    drive and of its coupled joints, times their squared ratios. If no forces that press at every
+    contact balance, each force is `force` along the inward normal. The targets are differentiable
+    in the joints of the grasps. The forces, found by a search, are not differentiable in the
+    contacts.
 
     Args:
         hand: the hand of the grasps, on any device; the results are on that of the grasps.

@@ -140,8 +140,8 @@ def tip_velocity(
 ) -> Float[Tensor, "*b 3"]:
     """Return the commanded velocity [m/s] of each fingertip, the bracket in Eq. (25) of the paper.
 
-    It is (1 - lambda) K_P e_x + lambda C_F e_f, shortened to at most `MAX_SPEED`. e_x and e_f are
-    the errors of position and of force.
+    It is (1 - lambda) K_P e_x + lambda C_F e_f, shortened to at most `MAX_SPEED`. Here e_x and e_f
+    are the errors of position and of force.
 
     Args:
         position_error: e_x, from each fingertip to its contact [m].

@@ -151,7 +151,7 @@ class EdgeLift(NamedTuple):
     Attributes:
         drag: record of the drag; None if the plan has none.
         tries: the tries of the lift (`lift_grasps`). Empty if the drag failed. It is empty, too, if
-            the object ended so far off that most contacts of the grasps are not on it.
+            most contacts of the grasps are not on the object that the drag left.
     """
 
     drag: DragResult | None

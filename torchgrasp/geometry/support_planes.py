@@ -45,8 +45,8 @@ class SupportNumbers:
     noise. Such a part is not bowed.
     """
     downward: float = 0.3
-    """Least cosine between the normal and the image's downward direction of a plane that an upright
-    camera cannot see from above. A wall faces a camera that looks down so.
+    """Least cosine between the normal of a plane and the image's downward direction. An upright
+    camera cannot see this plane from above. A wall faces a camera that looks down so.
     """
     upside_down: float = 0.25
     """Factor on the score of such a plane: few cameras are upside down."""

@@ -332,8 +332,8 @@ def link_clearance(
 ) -> list[Float[Tensor, "g"]]:
     """Return three least clearances (g,) [m] of each hand.
 
-    They are of links from the object (tips are left out if `tips_touch`), of tips from the object,
-    and of all links from the table. They are infinite if the world has no object or no table.
+    They are of links and of tips from the object, and of all links from the table. The links leave
+    out the tips if `tips_touch`. They are infinite if the world has no object or no table.
     """
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres

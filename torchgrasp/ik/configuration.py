@@ -3,8 +3,8 @@
 A Jacobian is built from wrenches. The derivative of a residual by a joint or pose motion is the
 product of a wrench and a twist. The wrench is about the object's origin, and the twist is that of
 the motion. Here g counts configurations. The q motions are three translations along the hand's
-axes, three rotations about them, and the joints that the actuated joints move. The number d = 6 + h
-counts pose and actuated joints.
+axes, and three rotations about them. Last are the joints that the actuated joints move. The number
+d = 6 + h counts pose and actuated joints.
 """
 
 import dataclasses

@@ -65,9 +65,10 @@ def tip_rows(
     """Return 4 f residuals of fingertips: position errors, then errors of contact directions.
 
     A position error has three components [mm], times `TIP_WEIGHT`. A contact direction has one
-    residual, times `PAD_WEIGHT`. It is the cosine of the pad's cone less that of the direction's
-    angle from the pad's axis, or 0 inside the cone. `target` [m] holds the wanted centres of the
-    tips. `normals` are the outward unit normals at their contacts, both in the object's frame.
+    residual, times `PAD_WEIGHT`. It is the cosine of the pad's cone less the cosine of the
+    direction's angle from the pad's axis. Inside the cone it is 0. `target` [m] holds the wanted
+    centres of the tips. `normals` are the outward unit normals at their contacts, both in the
+    object's frame.
     """
     tips = spatial.hand.tips
     motion = spatial.hand.motion

@@ -369,9 +369,9 @@ class _PressSearch:
 def _is_steady(postures: PressPostures, ways: Float[Tensor, "t 3"]) -> Bool[Tensor, "p t"]:
     """Return whether each posture presses on steadily while it drags along each of `ways`.
 
-    Where a tip sticks, a motion of the palm along the unit vector w changes the tip's force by K w.
-    Here K is the tip's stiffness. So each newton of the drag, w . K w, changes the pressing force
-    by -z . K w.
+    A tip may stick. Then a motion of the palm along the unit vector w changes the tip's force by K
+    w. Here K is the tip's stiffness. So each newton of the drag, w . K w, changes the pressing
+    force by -z . K w.
     """
     force = torch.einsum("pfij,tj->ptfi", postures.stiffness, ways)
     along = (force * ways[:, None]).sum(-1)

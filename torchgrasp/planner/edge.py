@@ -101,10 +101,9 @@ def plan_edge_grasps(
             three times (`DRAG.reserve`) the least one that moves the object (Coulomb's law).
 
     Raises:
-        BadArgument: a table without an edge, or one whose edge is more than 15 mm (`DRAG.behind`)
-            behind the object's estimated centre of mass. There the object would fall. Also one
-            whose edge is more than 2 m (`DRAG.farthest`) from all points: its numbers are not
-            metres.
+        BadArgument: a table without an edge; or an edge more than 15 mm (`DRAG.behind`) behind the
+            object's estimated centre of mass. There the object would fall. Also one whose edge is
+            more than 2 m (`DRAG.farthest`) from all points: its numbers are not metres.
         BadArgument: a friction of the fingertips that is not greater than `table_friction`.
 
     >>> import torch

@@ -378,8 +378,8 @@ def _carried(objects: Objects, found: Candidates, spec: ContactSpec) -> Float[Te
     """Return which share of its set's load, at most 1, the fingers of each initial posture can
     carry.
 
-    A set that carries its load with the least strength of its postures at each contact carries it
-    in all of them. So most sets need one linear programme.
+    A set may carry its load with the least strength of its postures at each contact. It then
+    carries it in all of them. So most sets need one linear programme.
     """
     contacts = found.contacts
     seeds = found.seeds

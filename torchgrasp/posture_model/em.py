@@ -135,7 +135,7 @@ class FitProgress(Value):
             likelihood may fall after that.
         log_likelihood: mean log-likelihood (t,) [nats] of the standardised data before each step.
         jumped: whether the likelihood may fall. It may if a Gaussian got a new place in the last
-            step, or the next step uses another subset of the samples.
+            step. It also may if the next step uses another subset of the samples.
         rows: number of samples that the last step used; 0 before the first step.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])

@@ -58,7 +58,7 @@ class MaskNumbers:
 MASKS = MaskNumbers()
 # red, green and blue of a pixel are told apart in one whole number
 COLOUR_PLACES = np.array([1 << 32, 1 << 16, 1])
-# COCO's text of run lengths: the letter of 0, the bits of a letter, and the most bits of a number
+# COCO's text of run lengths: the letter of 0, bits of a letter, and the most bits of a number
 FIRST_LETTER = ord("0")
 LETTER_BITS = 5
 MOST_BITS = 35

@@ -415,8 +415,7 @@ class Scene(Value):
     @property
     def doubts(self) -> tuple[str, ...]:
         """Why the target may be several objects, or a part of one, a sentence each. They are those
-        of `advice` on creases and jumps in it, on gaps in its outline, and on objects that touch
-        it.
+        of `advice` on creases, on jumps and gaps, and on objects that touch the target.
 
         Empty without a target. Empty for a target that is `given`, too: its outline is no guess.
         """

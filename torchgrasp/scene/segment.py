@@ -268,8 +268,8 @@ def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
 
 
 def _is_noise(view: TableImage, deviations: Tensor, labels: Int[Tensor, "h w"], k: int) -> bool:
-    """Return whether the small object k is an uneven place of the table, or a fringe of a much
-    larger body.
+    """Return whether the small object k is an uneven place of the table, or the fringe of a large
+    body.
 
     `deviations` (h, w) are heights above the table over the noise's.
     """

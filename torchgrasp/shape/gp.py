@@ -79,10 +79,10 @@ class ShapeGP(Posterior, Normalisation):
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations,
             calibrated on known objects. `std_m` of `predict` includes this factor.
         cloud: the points [m] that the camera saw, after cleaning.
-        kind: how the hidden side was completed. It is as that of a "ball", of a body of
-            "revolution", of a "mirrored" body, or of an open "vessel". "guess" means from the
-            outline alone, or not at all. "cut off" means that the image border cuts the object off,
-            and "whole" that there is no hidden side.
+        kind: how the hidden side was completed. It is that of a "ball", of a body of "revolution",
+            of a "mirrored" body, or of an open "vessel". "guess" means from the outline alone, or
+            not at all. "cut off" means that the image border cuts the object off, and "whole" that
+            there is no hidden side.
 
     Results at given points are differentiable in the points to any order, and those of `sample`
     twice. At observed points they are twice differentiable, and normals of a thin plate once.

@@ -187,8 +187,8 @@ class Posterior(Value):
         """
         # The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2).
         # Here a_j is the weight of the distance at the observed point x_j, b_j that of its normal.
-        # The variance is k0 - k*^T A k*. Here k0 is the prior variance, k* the covariance of the
-        # point with the data, and A the inverse covariance of the data. Its gradient is -2 times
+        # The variance is k0 - k*^T A k*. Here k0 is the prior variance, and k* the covariance of
+        # the point with the data. A is the inverse covariance of the data. Its gradient is -2 times
         # the gradient of a mean with the weights A k*.
         evaluate = partial(_differentiable_jet, self)
         if self._is_plain(x):

@@ -3,7 +3,7 @@ with all contacts in a region.
 
 The region is chosen from the cloud before planning. For every second object it is the upper half of
 the cloud's bounding box. For the others it is the half of its longer horizontal side with fewer
-points, as a handle or a neck has. Both reach over the unseen depth. The objects lie where they were
+points, such as a handle or neck. Both reach over the unseen depth. The objects lie where they were
 seen. An object without a grasp fails.
 """
 

@@ -77,7 +77,7 @@ class PaperClosing:
     `ClosingReference.as_printed`. A damped inverse replaces J^-1; speed is bounded. No joint target
     is so far ahead of its joint that the drive would exceed its torque limit. The closing ends when
     all fingers touch, and two conditions hold. The share of force control (lambda, Eq. 26) is at
-    least 0.5 in each, and the forces have been steady for `SETTLED` seconds.
+    least 0.5 in each finger. The forces have been steady for `SETTLED` seconds.
     """
 
     palm = STILL

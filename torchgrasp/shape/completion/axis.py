@@ -3,7 +3,7 @@
 The lines along the normals of a surface of revolution meet its axis. They lie in a linear line
 complex of pitch 0 (Pottmann and Wallner, Computational Line Geometry, 2001). A normal's line misses
 the axis by a distance. It is the moment of the normal about a point of the axis times the axis
-direction, and linear in either factor.
+direction. It is linear in either factor.
 """
 
 import dataclasses
@@ -70,8 +70,8 @@ class RoundNumbers:
 
     miss: float = 0.2
     least_radius: float = 0.01
-    """A normal meets the axis if the distance of its line is at most `miss` times the radius of the
-    point. If it is greater, `least_radius` [m] takes the place of this radius.
+    """A normal meets the axis if its line is at most `miss` times the radius of the point away. If
+    it is greater, `least_radius` [m] takes the place of this radius.
     """
     roundness: float = 0.055
     error: float = 0.0018
