@@ -115,8 +115,8 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
 def remove_outliers(cloud: PointCloud) -> PointCloud:
     """Return the cloud without duplicate points and without outliers, such as flying pixels.
 
-    Each point has a mean distance to its 8 nearest neighbours. That of an outlier is more than 2.5
-    times (`NEAR.outlier`) the median of these distances.
+    Each point has a mean distance to its 8 nearest neighbours. The mean distance of an outlier is
+    more than 2.5 times (`NEAR.outlier`) the median of all points.
 
     Raises the errors of `check_cloud`.
 

@@ -112,7 +112,7 @@ def read_cloud(
       it is closed.
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z. VIEWPOINT
       gives the camera. Its default `0 0 0 1 0 0 0` counts only if a camera there can have seen the
-      points. It does not count below all of them, where a robot's base is.
+      points. If this place is below all points, it does not count: it may be a robot's base.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `table` (4,),
       `frustum` (4, 3), `pose_error` (n,). For several views: `viewpoint` (n, 3) and `frustum` (n,
       4, 3). Other arrays are not read; a note names them.
@@ -440,7 +440,7 @@ def _find_repeated(points: Tensor, keep: Tensor, notes: list[str]) -> Tensor:
     """Return a mask of the rows at one place, if it holds far more rows than other places do. Add a
     note on them.
 
-    Only the rows of the mask `keep` count. Those at one place are missing pixels: (0, 0, 0), moved
+    Only the rows of the mask `keep` count. Rows at one place are missing pixels: (0, 0, 0), moved
     with the other points, or (-1, -1, -1).
     """
     none = torch.zeros_like(keep)

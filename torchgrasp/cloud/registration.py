@@ -5,9 +5,9 @@ which they agree best. It is the root mean square, over the points, of how far t
 along their normals. So shifts to and from a camera count alike, and turns and scales count. Slides
 along a surface that do not change it count nothing. Cameras need not be known. Second, this motion
 is a most likely one. What the overlap does not show stays as given, since the poses are known to
-some mm. Registration with `align` is the same motion, so a package for it would do less. Those that
-we know let a bottle spin about its axis. Third, what a camera saw through is empty. Points that
-another view has before a surface contradict it, with or without an overlap.
+some mm. Registration with `align` is the same motion, so a package for it would do less. The
+packages that we know let a bottle spin about its axis. Third, what a camera saw through is empty.
+Points that another view has before a surface contradict it, with or without an overlap.
 """
 
 import dataclasses

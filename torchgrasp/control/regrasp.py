@@ -211,7 +211,7 @@ class GraspTry:
         """Return the next try, at the object where it is now expected; None if no grasp is left.
 
         Its grasp is the one of `others` that most likely holds, given that the tried grasps failed.
-        In three cases it is the first of `others`. There is no `surface`, or the grasps were
+        Without a `surface` it is simply the first of `others`. So it is for grasps that were
         planned without a table or not ranked by success.
 
         The `grasps` of the next try have in `meta` what this try has shown, as texts of a

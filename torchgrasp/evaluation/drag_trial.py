@@ -65,10 +65,11 @@ class DragResult(Value):
     """The record of a simulated drag.
 
     Attributes:
-        status: `OK`; `NO_CONTACT` if the hand could not press, or lost the object on the way;
-            `DROPPED` if the object toppled, or hangs or fell over the edge; `SLIPPED` if it is
-            more than 20 mm (`DRAGS.slipped`) from where the plan wanted it; `START_OVERLAP` or
-            `UNSTABLE` as in `close_hand`.
+        status: `OK`, or the reason of a failure.
+            `NO_CONTACT`: the hand could not press, or lost the object on the way.
+            `DROPPED`: the object toppled, or hangs or fell over the edge.
+            `SLIPPED`: the object is more than 20 mm (`DRAGS.slipped`) from its planned place.
+            `START_OVERLAP` and `UNSTABLE`: as in `close_hand`.
         motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform; NaN if
             the drag is `UNSTABLE`.
         missed: distance [m] of the object's centre of mass from where the plan wanted it; NaN in

@@ -53,7 +53,7 @@ def save_dexgraspbench(
     the evaluator accepts nothing else. It holds only arrays, numbers and a text: `obj_path`,
     `obj_scale` (1), `obj_pose` (identity), `pregrasp_qpos`, `grasp_qpos` and `squeeze_qpos`. Each
     `qpos` has 23 numbers: position [m] and quaternion (w, x, y, z) of the hand, then 16 joints
-    [rad]. Those of the squeeze are targets with which the fingers press.
+    [rad]. The joints of the squeeze are targets with which the fingers press.
 
     Args:
         hand: the Allegro hand, whose model DexGraspBench has.

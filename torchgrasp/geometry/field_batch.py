@@ -23,8 +23,8 @@ class FieldBatch(DistanceField):
     """The distance fields of c objects, joined, so that a batch of points can have a field for each
     entry.
 
-    Points given to a method have the shape (r, ..., 3). Those of entry r of axis 0 belong to the
-    field with the index `owner[r]`.
+    Points given to a method have the shape (r, ..., 3). The points of entry r of axis 0 belong to
+    the field with the index `owner[r]`.
     """
 
     nodes: Float[Tensor, "n"]  # signed distances [m] of all fields, one after another

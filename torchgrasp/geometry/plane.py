@@ -138,7 +138,8 @@ class Plane(Value):
     def describe(self) -> str:
         """Return the normal and the offset [m] as text, such as "normal 0 0 1, offset 0.1".
 
-        Those of an edge follow, after "; edge".
+        If the plane has an `edge`, the text goes on with "; edge", and normal and offset of the
+        edge.
         """
         x, y, z = self.normal.tolist()
         text = f"normal {x:.9g} {y:.9g} {z:.9g}, offset {self.offset:.9g}"

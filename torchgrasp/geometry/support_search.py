@@ -456,7 +456,7 @@ class _Risen:
     """Masks of the points above a support that are not those of furniture.
 
     Points `over` the support are above its own region and within reach. Points that are `low` are
-    near its plane. Those of both kinds are of objects that are `standing` on it.
+    near its plane. Points of both kinds are of objects that are `standing` on it.
     """
 
     over: Bool[Tensor, "n"]

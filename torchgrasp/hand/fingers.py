@@ -77,9 +77,10 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
-        """Return what `expand` returns, without a check for NaN and infinity, which pass.
+        """Return the positions (*b, j) [rad or m] of all j movable joints of the URDF.
 
-        On a GPU such a check would wait for the numbers.
+        Unlike `expand`, it does not check for NaN and infinity. On a GPU this check would wait for
+        the numbers.
 
         Args:
             joints: positions (*b, h) [rad or m] of the h actuated joints.

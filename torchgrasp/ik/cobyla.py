@@ -133,8 +133,8 @@ class CobylaRun:
 
         First are those between the hand's own links. Then follow those from the object to the palm,
         to each finger and to each fingertip. Last are those from the table and from obstacles to
-        the hand. Those for which the world has no part are left out. `frames` are the link frames
-        in the hand's frame, and `pose` [m] is the hand's in the object's frame.
+        the hand. Clearances for which the world has no part are left out. `frames` are the link
+        frames in the hand's frame, and `pose` [m] is the hand's in the object's frame.
         """
         world = self.world
         spheres = self.hand.collision_spheres

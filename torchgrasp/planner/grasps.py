@@ -103,8 +103,8 @@ def plan_grasps(
               (n, 3). It may also be a cloud of Open3D or trimesh, or a file for `read_cloud` or
               `read_scene`.
             Missing normals and viewpoint are estimated; `cloud_from_array` adds known ones.
-            A sequence of clouds gives a list of `Grasps`. Those of a cloud that cannot be planned
-              on are empty, and `meta["refused"]` says why. An unreadable cloud raises.
+            A sequence of clouds gives a list of `Grasps`. The grasps of a cloud that cannot be
+              planned on are empty, and `meta["refused"]` says why. An unreadable cloud raises.
         hand: from `load_hand`, or its name or folder; it is moved to the device of the cloud.
         spec: constraints; None means `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         starts: number of random initial guesses of the contact planner.
@@ -146,11 +146,13 @@ def plan_grasps(
         Grasps: executable ones (`Status.OK`) first, best first; if none, see `explain_empty`.
 
     Raises:
-        BadArgument: an argument of the wrong type or range; an object that is not of graspable
-            size; a camera that cannot have seen the points; a table above most points or a camera,
-            or more than 2 m below the object's top; a scene without a target; `keep` off the
-            object; an `arm` of another hand; a `promise` for a displaced object; `shape`, `arm`,
-            `observer`, `reachable` or a region beside several clouds; a bad file of cloud or hand.
+        BadArgument: an argument of the wrong type or range; a bad file of cloud or hand.
+        BadArgument: an object that is not of graspable size; a scene without a target.
+        BadArgument: a camera that cannot have seen the points.
+        BadArgument: a table above most points or a camera, or more than 2 m below the object's top.
+        BadArgument: `keep` off the object; an `arm` of another hand.
+        BadArgument: a `promise` for a displaced object.
+        BadArgument: `shape`, `arm`, `observer`, `reachable` or a region beside several clouds.
         MissingExtra, NoWorkers: pebble or numba is not installed, or no worker process can start.
 
     If cloud, camera and table are moved together, the grasps move with them. In a scene the hand
@@ -223,7 +225,7 @@ def stream_grasps(
         fingers, task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
         mode, ranking, time_budget, shape, observer: as in `plan_grasps`.
 
-    Raises the errors of `plan_grasps`. Those of arguments and files are raised at the call. Those
+    Raises the errors of `plan_grasps`. Errors of arguments and files are raised at the call. Errors
     of what the points show, such as a wrong size, are raised at the first iteration.
 
     >>> from torchgrasp import load_hand, load_object

@@ -87,11 +87,11 @@ class Request:
     def __post_init__(self) -> None:
         """Raise `BadArgument` for arguments that contradict each other.
 
-        These are an arm of another hand, and no load to resist. Another is a box or mesh to keep to
-        off the object. A `promise` (the share of returned grasps that hold) contradicts a displaced
-        object. The warning `NoEffect` tells of a box or mesh that changes nothing. One to avoid is
-        off the object, or one to keep to holds all of it. Raises `MissingExtra` if compiled loops
-        are asked for without numba.
+        These are an arm of another hand, no load to resist, and a `keep` off the object. A
+        `promise` (the share of returned grasps that hold) contradicts a displaced object. The
+        warning `NoEffect` tells of a box or mesh that changes nothing. One to avoid is off the
+        object, or one to keep to holds all of it. Raises `MissingExtra` if compiled loops are asked
+        for without numba.
         """
         is_fused()
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:

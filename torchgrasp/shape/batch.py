@@ -167,9 +167,9 @@ class Walls(Value):
 class ShapeBatch(Value):
     """The shapes of c clouds, for a batch in which each entry belongs to one cloud.
 
-    Points given to a method have the entries as axis 0. Those of entry r belong to the cloud with
-    the index `owner[r]`. Numbers of a shape, such as its `scale`, are tensors with one number for
-    each entry. Distances at normalised points are normalised, too.
+    Points given to a method have the entries as axis 0. The points of entry r belong to the cloud
+    with the index `owner[r]`. Numbers of a shape, such as its `scale`, are tensors with one number
+    for each entry. Distances at normalised points are normalised, too.
 
     Args:
         surfaces: the posteriors of all surfaces: one for each cloud, then the inner ones of open

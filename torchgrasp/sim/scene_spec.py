@@ -184,8 +184,8 @@ class SceneSpec:
     def slides(self) -> list["Slide"]:
         """The prismatic joints of the mount that carries the hand, from the world to the hand.
 
-        They are `mount` if it is given. Otherwise they are those of lift, approach and yielding,
-        as far as `travel`, `approach` and `yields` need them.
+        They are `mount` if it is given. Otherwise there is one joint for the lift. One for the
+        approach follows if `approach` is not zero, and three for yielding if `yields` is positive.
         """
         if self.mount is not None:
             return list(self.mount)
@@ -223,8 +223,8 @@ class SceneSpec:
     def ledge(self) -> "Ledge":
         """The box that is the table, if the table has an `edge`.
 
-        It is under the object and ends at the edge, or as far beyond the object as it reaches
-        elsewhere.
+        The box is under the object. It ends at the edge, or `SIMULATION.reach` [m] beyond the
+        object's middle if the edge is farther.
         """
         assert self.edge is not None
         x, y, offset = self.edge

@@ -107,7 +107,7 @@ def greatest_force(
     """Return the largest factor (no unit) on the `forces` [N] of each of g grasps. At it no drive
     exceeds its greatest torque.
 
-    The forces at the contacts are in the frame of the grasps. Those that are NaN give NaN.
+    The forces at the contacts are in the frame of the grasps. Forces that are NaN give NaN.
     """
     jacobian, pushes, effort = _levers(hand, grasps, grasps.contacts, forces)
     torque = torch.einsum("gfih,gfi->gh", jacobian, pushes)

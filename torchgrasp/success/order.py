@@ -31,8 +31,8 @@ More would break the promise that 0.9 of the grasps hold.
 def is_covered(features: Float[Tensor, "g k"], names: Sequence[str] = DOMAIN) -> Bool[Tensor, "g"]:
     """Return a mask of the g grasps for which trials support the prediction of success.
 
-    `features` has a column for each name in `FEATURES`. Those in `names` must lie within the range
-    of the trials.
+    `features` has a column for each name in `FEATURES`. The features in `names` must lie within the
+    range of the trials.
     """
     rows = [FEATURES.index(name) for name in names]
     least, most = load_success_model(features.device).range[rows].T

@@ -78,9 +78,9 @@ def explain_success(
     greatest first.
 
     Each cause stands for several features of the success model. Its `log_odds` is by how much the
-    log-odds rise if these features take their median over grasps that held. Where no forces of the
-    fingers carry a lifted weight, "load" counts for more. Causes that do not lower the success are
-    left out.
+    log-odds rise if these features take their median over grasps that held. If no forces of the
+    fingers carry the weight of a lifted object, the `log_odds` of "load" are greater (`UNCARRIED`).
+    Causes that do not lower the success are left out.
 
     If no trial has tested some of the task's frictions and masses, "task" is always among the
     causes. Its sentence then says for what share of them the success is unknown.

@@ -166,9 +166,10 @@ class ClosureResult(Value):
         stops: number of stops of the approaching hand at a contact.
         attempts: number of closings of the hand.
         seconds: wall time [s] of the trial.
-        friction: `Distribution` of the coefficient of friction: the planned one, limited to what
-            sticking and sliding fingertips allow. If nothing is left of it, it is what they allow
-            without the plan. None if the hand did not hold in the mode "grip".
+        friction: `Distribution` of the coefficient of friction. It is the planned distribution,
+            limited to the interval that sticking and sliding fingertips allow. If the plan excludes
+            this interval, the touches alone decide. None if the hand did not hold in the mode
+            "grip".
         mass: `Distribution` of the object's mass [kg], from the load that the hand felt while
             nothing pushed at the object. None if the mode "grip" felt no steady load.
     """
