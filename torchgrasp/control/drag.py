@@ -136,6 +136,8 @@ class DragController:
         Args:
             observation: what the hand measures now.
             period: time [s] until the next tick.
+
+        Raises `BadArgument` for a period outside 1e-5 to 1 s.
         """
         reading = observation.tactile.reading.where(self.presses, 0.0)
         force = float(reading.sum())

@@ -185,6 +185,8 @@ class GraspTry:
             observation: what the hand measures at the end of the tick (`observe`).
             height: height [m] to which the hand has risen.
             period: length [s] of the tick, 1e-5 to 1.
+
+        Raises `BadArgument` for a period out of range, or a height outside [-1, 10] m.
         """
         self.check(observation, height, period)
         return self.failed
@@ -204,6 +206,8 @@ class GraspTry:
             observation: the last observation, which shows where the fingers begin.
             period: length [s] of a tick, 1e-5 to 1.
             length: distance [m] by which the hand withdraws against its approach, at most 1.
+
+        Raises `BadArgument` for a period or a length out of range.
         """
         return Withdrawal(self.controller, observation, period, length)
 

@@ -118,6 +118,8 @@ def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -
         batch: sizes of further leading axes of all tensors; by default none.
         fingers: number of fingertips, 3 to 5.
 
+    Raises `BadArgument` for another number of fingertips, or a size below 1.
+
     >>> no_contact().contact
     tensor([False, False, False])
     """

@@ -115,7 +115,7 @@ def save_play(
 
     Raises:
         BadArgument: there are no grasps, joints are of another hand, or the grasps do not touch the
-            mesh. The plan's table has an edge, and the player is not "mujoco".
+            mesh. Also a plan with an edge of the table for a player other than "mujoco".
         MeshError: the mesh is open or malformed.
         OutputError: a file cannot be written.
 

@@ -275,6 +275,8 @@ class Hand(Value):
             joints: positions (*b, h) [rad or m] of the actuated joints.
             backend: what computes the poses of the fingertips: "torchgrasp", the tables of `tips`;
                 or "pytorch_kinematics", the hand's `chain`. The results agree up to rounding.
+
+        Raises `BadArgument` for joints of a wrong count, or another `backend`.
         """
         if backend == "torchgrasp":
             _, frames = self.tips.frames(self._columns(joints))
@@ -366,6 +368,8 @@ class Hand(Value):
                 the result is any number of at least `below`, or infinity. A small `below` saves
                 time.
             chunk: number of postures that are computed at a time, which bounds the memory.
+
+        Raises `BadArgument` for joints of a wrong count, or a `chunk` below 1.
         """
         self.actuated.check(joints)
         rows = joints.reshape(-1, joints.shape[-1])

@@ -74,6 +74,8 @@ class Obstacles(Value):
             full: probability from which a voxel counts as occupied, in [0.01, 1].
             hard: whether links must not touch occupied voxels. Otherwise a collision only lowers
                 the predicted success.
+
+        Raises `BadArgument` for a `full` out of range.
         """
         # SciPy's distances
         device = occupancy.origin.device
@@ -133,9 +135,10 @@ class CollisionWorld(Value):
     does not exist.
 
     Args:
-        field: signed distances [m] from the object, negative inside. Of one object for all hands of
-            a batch it is a `SignedDistanceField`, as `surface_field` makes it. The planner also
-            uses a `torchgrasp.geometry.field_batch.FieldBatch`, of one object for each hand.
+        field: signed distances [m] from the object, negative inside. If all hands of a batch have
+            the same object, it is a `SignedDistanceField`, as `surface_field` makes it. If each
+            hand has its own object, as in the planner, it is a
+            `torchgrasp.geometry.field_batch.FieldBatch`.
         table: the table's plane, or its height [m] along z.
         obstacles: other bodies of a scene.
 

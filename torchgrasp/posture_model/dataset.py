@@ -132,7 +132,10 @@ class SampleFolder:
 
     @checked
     def path(self, i: Chunk) -> Path:
-        """Return the path of the file of chunk i, counted from 0. The file need not exist."""
+        """Return the path of the file of chunk i, counted from 0. The file need not exist.
+
+        Raises `BadArgument` for a negative index.
+        """
         return self.folder / f"chunk-{i:06d}.safetensors"
 
     @checked

@@ -587,6 +587,8 @@ class Scene(Value):
         Args:
             obj_from_upright: pose (4, 4) [m] of the upright frame in the frame "obj". Its z axis
                 must be the table's normal, and its origin on the table. This is not checked.
+
+        Raises `BadArgument` for a transform that is not rigid.
         """
         obj_from_upright = obj_from_upright.double()
         return dataclasses.replace(

@@ -128,6 +128,8 @@ class ShapeGP(Posterior, Normalisation):
             psi: the kernel's length, normalised.
             std_factor: ratio of the surface's true deviations to the posterior's standard
                 deviations.
+
+        Raises `BadArgument` for a `psi` or `std_factor` that is not positive.
         """
         away = norm(posterior.x.detach())
         reach = DOMAIN.reach * float(away.max())
@@ -389,6 +391,8 @@ class ShapeGP(Posterior, Normalisation):
         """Return the shape in frame b, given the rigid transform `b_from_a` (4, 4) [m].
 
         Frame a is that of this shape's `cloud`; a point p of frame a is `b_from_a` p in frame b.
+
+        Raises `BadArgument` for a transform that is not rigid.
         """
         rotation = b_from_a[:3, :3].to(self.x)
         n = len(self.x)

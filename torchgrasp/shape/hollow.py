@@ -217,6 +217,8 @@ class HollowShape(ShapeGP):
         """Return the vessel in frame b, given the rigid transform `b_from_a` (4, 4) [m].
 
         Frame a is that of this shape's `cloud`; a point p of frame a is `b_from_a` p in frame b.
+
+        Raises `BadArgument` for a transform that is not rigid.
         """
         outer = self.outer.moved(b_from_a)
         return self.join(outer, self.inner.moved(b_from_a), outer.cloud)

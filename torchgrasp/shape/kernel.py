@@ -95,6 +95,8 @@ class Kernel:
             r: normalised distances of any shape (*s,), which each result has, too.
             count: number of results, 1 to 4.
 
+        Raises `BadArgument` for a `count` out of range.
+
         >>> half_square = Kernel(lambda r: r**2 / 2)
         >>> half_square.derivatives(torch.tensor([2.0]), 3)
         (tensor([2.]), tensor([1.]), tensor([0.]))
@@ -192,6 +194,8 @@ def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
         closed_form: whether derivatives are in closed form; False means autograd of the profile,
             which is slower.
 
+    Raises `BadArgument` for a `psi` that is not positive.
+
     >>> kernel = thin_plate_kernel(psi=2.0)
     >>> kernel.diameter
     1.5
@@ -237,6 +241,8 @@ def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     `length` is a normalised distance. `variance` is the prior variance of the signed distance, in
     squared normalised units.
 
+    Raises `BadArgument` for a length or variance that is not positive.
+
     >>> float(matern52_kernel(1.0).profile(torch.zeros(())))
     1.0
     """
@@ -265,6 +271,8 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
     `length` is a normalised distance. `variance` is the prior variance of the signed distance, in
     squared normalised units.
+
+    Raises `BadArgument` for a length or variance that is not positive.
 
     >>> float(rbf_kernel(1.0).profile(torch.zeros(())))
     1.0

@@ -162,7 +162,10 @@ class SimulatedHand:
 
     @checked
     def rest(self, ticks: Annotated[int, Range(0, 1000000)]) -> None:
-        """Keep the last targets for a number of control ticks, without measurements."""
+        """Keep the last targets for a number of control ticks, without measurements.
+
+        Raises `BadArgument` for a negative number.
+        """
         self.scene.skip(ticks * self.substeps)
         self.steps += ticks * self.substeps
 
@@ -177,7 +180,10 @@ class SimulatedHand:
 
     @checked
     def ticks(self, seconds: Annotated[float, Range(0.0, 1e6)]) -> int:
-        """Return the whole number of control ticks nearest to `seconds` [s], at least one."""
+        """Return the whole number of control ticks nearest to `seconds` [s], at least one.
+
+        Raises `BadArgument` for a negative time.
+        """
         return max(1, round(seconds / self.period))
 
     def _observe(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray) -> Observation:

@@ -209,7 +209,10 @@ class Distribution(Value):
 
     @checked
     def times(self, factor: Positive) -> "Distribution":
-        """Return the distribution of `factor` times the number. `factor` is positive."""
+        """Return the distribution of `factor` times the number.
+
+        Raises `BadArgument` for a `factor` that is not positive.
+        """
         return self._mapped(lambda x: factor * x)
 
     @checked
@@ -270,6 +273,8 @@ class Distribution(Value):
         """Return `count` independent random numbers (count,), as float64 on the CPU.
 
         `count` is 1 to 10,000, and `seed` the random seed.
+
+        Raises `BadArgument` for a `count` or `seed` out of range.
         """
         generator = torch.Generator().manual_seed(seed)
         drawn = torch.rand(count, generator=generator, dtype=torch.float64, device="cpu")
@@ -320,6 +325,8 @@ class Distribution(Value):
         middles are the nodes. The greater an interval's probability, the more pieces it has. If the
         distribution has more `parts` than `count`, the nodes are the `count` quantiles (i + 1/2) /
         `count`.
+
+        Raises `BadArgument` for a `count` out of range.
 
         >>> [node.tolist() for node in Distribution.between(0.0, 1.0).nodes(2)]
         [[0.25, 0.75], [0.5, 0.5]]
