@@ -159,8 +159,8 @@ def hold_probability(
         weight: the weight that the contacts carry. None means that they must resist any load, and
             that the fingertips press as much as it needs.
         shape: the uncertain shape in the frame of the contacts. Random surfaces are drawn from it
-            as in `closure_probability`; each of them has one of as many other errors. None means
-            that the planned contacts lie on the true surface.
+            as in `closure_probability`. With each surface goes one set of the other errors. None
+            means that the planned contacts lie on the true surface.
         draws: number of random surfaces, if there is a `shape`.
         seed: random seed of the surfaces.
 

@@ -232,12 +232,12 @@ class SimulatedScene(abc.ABC):
     def approach(self, left: float, speed: float = 0.0) -> None:
         """Set the target of the approach along `SceneSpec.approach`, until the next call.
 
-        Raises `BadArgument` for a scene whose `SceneSpec.approach` is zero.
-
         Args:
             left: target distance [m] that is left to the end of the approach.
             speed: speed [m/s] at which the target itself moves forward; negative backward. 0 means
                 that the mount comes to rest at `left`.
+
+        Raises `BadArgument` for a scene whose `SceneSpec.approach` is zero.
         """
         self._drive_mount(APPROACH_JOINT, -left, speed)
 
