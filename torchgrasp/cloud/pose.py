@@ -411,7 +411,7 @@ def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
         if float(plane.normal[1]) <= POSE.upturned:
             return ()
         return (
-            "the camera hangs upside down, as the table shows; if it does not, the image is "
+            "the camera hangs upside down, as the table shows. If it does not, the image is "
             "flipped, and objects are mirrored: give depth[::-1]",
         )
     cosine = float(plane.normal[2])

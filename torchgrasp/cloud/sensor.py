@@ -401,7 +401,7 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
     Raises:
         BadArgument: no frame, or frames of several sizes or dtypes.
         BadArgument: camera or scene have moved. This is so if a frame differs from the median in
-            more than 5 % of its pixels, or 1 % of its patches (`STILL`).
+            more than 5 % of its pixels. It is so, too, for 1 % of its patches (`STILL`).
 
     >>> frames = [[[0.0, 0.7]], [[0.0, 0.701]], [[0.5, 0.702]]]
     >>> median_depth([torch.tensor(frame) for frame in frames])

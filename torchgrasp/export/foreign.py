@@ -372,7 +372,7 @@ def _at_rest(
         warn_user(
             GraspFileWarning,
             f"pregrasp of {len(rows)} of {len(joints)} grasps, the first {rows[0]}: the wrist "
-            "moves to the grasp, ours does not; fingertips are up to "
+            "moves to the grasp, ours does not. Fingertips are up to "
             f"{1000 * float(left.max()):.1f} mm off the file's",
         )
     return torch.where(still[:, None], joints, reached)

@@ -220,7 +220,7 @@ def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -
         warn_user(
             GraspFileWarning,
             f"{path.name}: it names no hand, so that its joints alone tell that it is of the "
-            f"{hand.name} hand; one of the other side may have the same",
+            f"{hand.name} hand. One of the other side may have the same",
         )
     postures = {what: _fill(hand, fields, far) for what, fields in taken.items()}
     numbers = np.array(poses, dtype=float).reshape(-1, 7)

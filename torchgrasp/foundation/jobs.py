@@ -133,6 +133,7 @@ def _run_pool(
     except ImportError as error:
         raise MissingExtra("pebble", "sim") from error
     # The initializer imports the module of the function before the time of the first task begins.
+
     # whether only the script has the function
     own = b"__main__" in bytes(reduction.ForkingPickler.dumps(function))
     if _USUAL.get_start_method() == "forkserver":

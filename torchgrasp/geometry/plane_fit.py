@@ -203,8 +203,8 @@ def _is_same(fit: PlaneFit, other: PlaneFit) -> bool:
 
 
 def _levels(view: SeenPoints, fit: PlaneFit) -> list[PlaneFit]:
-    """Return the two parallel levels through which a fit goes aslant, as through the floors of a
-    room and a bin. Return an empty list if it is one plane.
+    """Return the two parallel levels through which a fit goes aslant, as through two floors. Return
+    an empty list if it is one plane.
     """
     if fit.scale < PLANES.mixed:
         return []

@@ -136,8 +136,8 @@ class SupportPlane:
     """A plane that objects stand on, and its region: the convex hull of the points on it."""
 
     plane: Plane  # the camera is above it
-    # of each side of the region: outward unit vector u (x, y, z) in the plane, and offset o [m],
-    # with u . p + o < 0 for points p within; None: the region is unbounded
+    # Of each side of the region: outward unit vector u (x, y, z) in the plane, and offset o [m].
+    # For points p within, u . p + o < 0. None: the region is unbounded.
     sides: Float[Tensor, "s 4"] | None = None
     width: float = math.inf  # least width of the region [m]
     # whether it is bowed or small, so that the plane holds near its region only

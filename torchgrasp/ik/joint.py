@@ -109,8 +109,8 @@ class JointState(Batch):
         """Return the states of g grasps after a `step` (g, d) of all unknowns.
 
         The d columns are changes of the hand pose (6), the joints [rad], the contact points (3 f)
-        and the tensions, in this order. The change of the pose is a translation [m] and a rotation
-        vector [rad] in the hand's axes. Points are normalised, and tensions have no unit.
+        and the tensions. The change of the pose is a translation [m] and a rotation vector [rad] in
+        the hand's axes. Points are normalised, and tensions have no unit.
         """
         by_hand, by_points, by_tension = step.split(
             [6 + hand.dof, self.points[0].numel(), self.tension.shape[1]], 1

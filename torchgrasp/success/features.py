@@ -51,8 +51,8 @@ CAUSES: dict[str, dict[str, str]] = {
 * "surface": the greatest standard deviations of the surface and of its normal at a contact.
 * "object": `size`, `height` and `breadth` of `EstimatedBody`.
 * "task": the friction coefficient; the mass; the normal force of the strongest finger. This force
-  is 0 if the hand presses as the load needs. Then 1 if true, else 0, for: the object is lifted; it
-  may be displaced; the hand closes in open loop.
+  is 0 if the hand presses as the load needs. Then 1 if true, else 0: the object is lifted; it may
+  be displaced; the hand closes in open loop.
 """
 # All features, in the order of the columns.
 FEATURES = tuple(name for names in CAUSES.values() for name in names)

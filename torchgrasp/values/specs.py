@@ -194,15 +194,15 @@ class ContactSpec(Value):
     def relaxed(self, below: Length, radius: Length) -> "Iterator[ContactSpec]":
         """Yield weaker constraints for an object without grasps, the strictest first.
 
-        First come specs with a smaller `flat_radius`: 8, 6, 4 and 3 mm (`FLAT_RADII`), as far as
-        they are less than `below`.
+        First come specs with a smaller `flat_radius`. They are 8, 6, 4 and 3 mm (`FLAT_RADII`), as
+        far as they are less than `below`.
 
         With a table, three specs follow for the upper rim of a low object. They have a
         `flat_radius` of 1 mm (`RIM`). There a fingertip on the table touches an inclined surface.
         The estimated rim is too round, so its normals are too steep. Therefore the second spec
         gives up half of two margins, and the third spec all. The margin of the friction is given up
         as `planned_friction` rises to `mean_friction`. The margin of a `tip_radius` of None is
-        given up as it falls from at least 12 mm (`TIP_RADIUS`) to `radius`.
+        given up, too. It falls from at least 12 mm (`TIP_RADIUS`) to `radius`.
 
         There are no specs if `flatness` is None, or if `flat_radius` is not None.
 

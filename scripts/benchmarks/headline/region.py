@@ -3,8 +3,8 @@ with all contacts in a region.
 
 The region is chosen from the cloud before planning. For every second object it is the upper half of
 the cloud's bounding box. For the others it is the half of its longer horizontal side with fewer
-points, such as a handle or neck. Both reach over the unseen depth. The objects lie where they were
-seen. An object without a grasp fails.
+points, like a handle. Both reach over the unseen depth. The objects lie where they were seen. An
+object without a grasp fails.
 """
 
 import dataclasses

@@ -390,7 +390,7 @@ def _part_pairs(
             often = sorted(others, key=lambda pair: -shares[pair])[: DRAFT.listed]
             listed = ", ".join(f"{one} and {two} {shares[one, two]:.0%}" for one, two in often)
             warnings.append(
-                f"only {free:.1%} of random postures of option {name} are free; most often meet "
+                f"only {free:.1%} of random postures of option {name} are free. Most often meet "
                 f"{listed}: make their collision shapes smaller, or take pairs out"
             )
     out = {pair: share for pair, share in left_out.items() if share}
@@ -398,8 +398,8 @@ def _part_pairs(
         listed = ", ".join(f"{one} and {two} {share:.0%}" for (one, two), share in out.items())
         warnings.insert(
             0,
-            "pairs of links that leave no posture free are left out of [self_collision]; "
-            f"they meet in these shares of random postures: {listed}",
+            "pairs of links that leave no posture free are left out of [self_collision]. "
+            f"They meet in these shares of random postures: {listed}",
         )
     return left_out, warnings
 

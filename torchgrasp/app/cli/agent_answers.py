@@ -35,8 +35,8 @@ class GraspRow:
     )
     approach: Vector = required("unit direction in which the opened hand comes to its pose")
     rise: Vector = required(
-        "displacement [m] of the opened hand from its pose, until it closes: not zero where it "
-        "would be in the table"
+        "displacement [m] of the opened hand from its pose, until it closes. It is not zero where "
+        "the hand would be in the table"
     )
     pregrasp: dict[str, float] = required("positions of all joints of the opened hand [rad]")
     grasp: dict[str, float] = required("positions at which the fingertips touch [rad]")
@@ -152,7 +152,7 @@ class HandAnswer(Answer):
     abilities: dict[str, Any] | None = option(
         None,
         "what the chosen fingers can do, as abilities.json of `hand check`: widths [m], spans [m] "
-        "and forces at the tips [N]; units are in the names",
+        "and forces at the tips [N]. Units are in the names",
     )
 
 

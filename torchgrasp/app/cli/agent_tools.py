@@ -385,11 +385,11 @@ class PlanFromDepth(_PlanTool):
     """
 
     depth: str = required(
-        "depth image along the optical axis (.png of 16 bit, .tiff, .exr, .npy, .npz): integers "
+        "depth image along the optical axis (.png of 16 bit, .tiff, .exr, .npy, .npz). Integers "
         "are millimetres, floats metres; 0 and NaN are not measured"
     )
     intrinsics: tuple[float, ...] | str = required(
-        "fx fy cx cy [pixels] at the image's own resolution, or a file of ROS, Open3D, RealSense, "
+        "fx fy cx cy [pixels] at the image's own resolution. Or a file of ROS, Open3D, RealSense, "
         "Zivid or BOP (.json, .yaml)"
     )
     depth_unit: float | None = option(None, DEPTH_HELP["depth_unit"])

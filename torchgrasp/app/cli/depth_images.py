@@ -24,13 +24,11 @@ from torchgrasp.scene.scene import Scene
 
 DEPTH_HELP = (
     "image along the optical axis (.png of 16 bit, .tiff, .exr, .npy, or .npz with an array "
-    '"depth"): integers are '
-    "millimetres, floats metres; 0 and NaN are not measured"
+    '"depth"). Integers are millimetres, floats metres; 0 and NaN are not measured'
 )
 INTRINSICS_HELP = (
-    "fx fy cx cy in pixels, at the image's own resolution, and of a crop its width height; or a "
-    "file of ROS, Open3D, "
-    "RealSense, Zivid or BOP (.json, .yaml), or with a matrix (.npy, .txt)"
+    "fx fy cx cy in pixels, at the image's own resolution, and of a crop its width height. Or a "
+    "file of ROS, Open3D, RealSense, Zivid or BOP (.json, .yaml), or with a matrix (.npy, .txt)"
 )
 
 
@@ -49,10 +47,9 @@ class _DepthCommand(Command):
     mask: Path | None = option(
         None,
         "mask of the object, of the depth's size and not 0 there, for `cloud scene` also of "
-        "several objects: a picture "
-        "with a colour or a number for each (.png, .tiff, .npy), masks (.npy, .npz), or COCO's "
-        "run lengths (.json); by "
-        "default every point is kept, or every object of a scene is found",
+        "several objects. It is a picture with a colour or a number for each (.png, .tiff, .npy), "
+        "masks (.npy, .npz), or COCO's run lengths (.json). By default every point is kept, or "
+        "every object of a scene is found",
     )
     camera_pose: Path | None = option(
         None,
@@ -148,7 +145,7 @@ class CloudScene(_DepthCommand):
     )
     table: tuple[float, ...] | None = option(
         None,
-        "height z of the table, or four numbers nx ny nz d of the plane n . p = d [m]; by default "
+        "height z of the table, or four numbers nx ny nz d of the plane n . p = d [m]. By default "
         "it is found",
     )
     point: tuple[float, ...] | None = option(

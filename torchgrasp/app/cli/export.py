@@ -92,8 +92,8 @@ class Export(Command):
     object: str | None = option(
         None,
         "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit, "
-        "isaac: the object's id, or frame; "
-        "glb, play-..., usd: a mesh; by default the estimated surface.ply of GRASPS",
+        "isaac: the object's id, or frame. For glb, play-..., usd a mesh, by default the "
+        "estimated surface.ply of GRASPS",
     )
     mass: float | None = option(None, "play-..., usd: mass of the object [kg]; by default 0.1")
     friction: float | None = option(None, "play-..., usd: coefficient of friction; by default 0.8")

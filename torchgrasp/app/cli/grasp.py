@@ -96,7 +96,7 @@ class Grasp(ForPrograms):
     )
     realsense: bool = option(
         False,
-        "instead of CLOUD, take the depth image of a connected RealSense, and write it as scene.npz "
+        "instead of CLOUD, take the depth image of a connected RealSense. It is written as scene.npz "
         'into the output folder (needs the extra "realsense")',
     )
     serial: str | None = option(None, "serial number of the RealSense, if several are connected")
@@ -149,8 +149,8 @@ class Grasp(ForPrograms):
     )
     keep: str | None = option(
         None,
-        'where contacts may be: a closed mesh, or a box as "X0 Y0 Z0 X1 Y1 Z1" [m] in the frame '
-        "of the cloud",
+        "where contacts may be, in the frame of the cloud: a closed mesh, or a box as "
+        '"X0 Y0 Z0 X1 Y1 Z1" [m]',
     )
     avoid: str | None = option(None, "where no contact may be: a mesh or a box, as in --keep")
     resist: tuple[TaskName, ...] = option(
@@ -159,7 +159,8 @@ class Grasp(ForPrograms):
     edge: tuple[float, ...] | None = option(
         None,
         "for low objects: X Y OX OY, a point on the edge of the table [m] and the direction away "
-        "from the table, in the frame of the cloud; six numbers X Y Z OX OY OZ where z is not up. "
+        "from the table. Where z is not up, give six numbers X Y Z OX OY OZ. All are in the frame "
+        "of the cloud. "
         "The hand presses on the object, drags it over the edge, and grasps it there",
     )
     table_friction: float = option(

@@ -105,8 +105,8 @@ class HandNew(Command):
     )
     tips: tuple[str, ...] = option(
         (),
-        'links of three to five fingertips in grasp order, first the three of option "default"; '
-        '"four" and "five" add '
+        'links of three to five fingertips in grasp order, first the three of option "default". '
+        'Options "four" and "five" add '
         "the next. By default the ends of the tree's branches, in the order in which their pads "
         "face best",
     )
@@ -118,7 +118,7 @@ class HandNew(Command):
     )
     tip_offset: tuple[float, ...] = option(
         (),
-        "lengths [m] of sensor tips that the URDF lacks, from the maker's tip outward: one, or with "
+        "lengths [m] of sensor tips that the URDF lacks, from the maker's tip outward. One, or with "
         "--tips one for each; docs/hands.md states the direction",
     )
     tip_radius: tuple[float, ...] = option(
@@ -345,9 +345,9 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
     if share < TRIAL.least_free ** (len(hand.tips) / 3):
         one, two = most_met(hand, joints[: TRIAL.some])
         warnings.append(
-            f"only {share:.0%} of random postures are free, most often {one} meets {two}: if this "
-            "is impossible, make "
-            "their collision shapes smaller, or take the pair out of [self_collision]"
+            f"only {share:.0%} of random postures are free. Most often {one} meets {two}: if this "
+            "is impossible, make their collision shapes smaller, or take the pair out of "
+            "[self_collision]"
         )
     points, normals = hand.fingertips(joints[free])
     inward = points.mean(1, keepdim=True) - points
@@ -356,10 +356,9 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
     for name, seen in zip(hand.finger_names, facing.tolist(), strict=True):
         if seen < TRIAL.least_facing:
             warnings.append(
-                f"the pad of {name} faces the others in {seen:.1%} of free postures: if its arrow "
-                "in the picture "
-                "points the wrong way, turn contact and normal in hand.toml; or name other "
-                f"fingers in {named}"
+                f"the pad of {name} faces the others in {seen:.1%} of free postures. If its arrow "
+                "in the picture points the wrong way, turn contact and normal in hand.toml. Or "
+                f"name other fingers in {named}"
             )
     closing = float(can_close(points, normals).double().mean()) if len(points) else 0.0
     if closing < TRIAL.least_closing:

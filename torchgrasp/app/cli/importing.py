@@ -50,7 +50,7 @@ class Import(Command):
     fingers: str = option("default", FINGERS_HELP)
     joints: tuple[str, ...] = option(
         (),
-        "names of the joints in the order of the file, where the file has no names; JOINT:-1 turns "
+        "names of the joints in the order of the file, where the file has no names. JOINT:-1 turns "
         "a sign, JOINT:FACTOR:OFFSET [rad] converts",
     )
     quaternion: Quaternion = option("wxyz", "order of the numbers of a rotation in the file")
@@ -58,7 +58,7 @@ class Import(Command):
     root: tuple[str, ...] = option(
         (),
         "the hand's frame in the file: a link of our URDF, or position [m] and quaternion wxyz of "
-        "our root link in it; by default what the file names, or our root link",
+        "our root link in it. By default it is what the file names, or our root link",
     )
     cloud: Path | None = option(
         None,

@@ -70,10 +70,9 @@ class ViewOptions:
     )
     camera_pose: Path | None = option(
         None,
-        "file with frame_from_camera, 4 x 4 (.npy or .txt), for a cloud in the camera's frame (x "
-        "right, y down, z "
-        "forward). The cloud is moved into the pose's frame; results are in this frame, and the "
-        "camera is known",
+        "file with frame_from_camera, 4 x 4 (.npy or .txt), for a cloud in the camera's frame. Its "
+        "axes are x right, y down, z forward. The cloud is moved into the pose's frame. Results are "
+        "in this frame, and the camera is known",
     )
 
     @property
@@ -137,9 +136,8 @@ class CloudOptions(ViewOptions):
     table: tuple[float, ...] | None = option(
         None,
         "height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = "
-        "d [m]; by default the "
-        "file's, as `cloud cut` writes it, else at the lowest point of the cloud that is no "
-        "outlier",
+        "d [m]. By default the table is the file's, as `cloud cut` writes it. Else it is at the "
+        "lowest point of the cloud that is no outlier",
     )
     no_table: bool = option(False, "there is no table")
 
