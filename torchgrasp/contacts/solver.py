@@ -80,8 +80,8 @@ class State(Batch):
     """The solver's state for b contact sets of f contacts.
 
     `points` (b, f, 3) are the normalised contacts. `tension` (b, p) is that of each of p pairs of
-    contacts (see `contacts.problem`). It is scaled so that the mean size of the contact forces is
-    1. `jet` holds signed distance and variance of the surface at the points, with derivatives.
+    contacts (see `contacts.problem`). Its scale makes the mean size of the contact forces 1. `jet`
+    holds signed distance and variance of the surface at the points, with derivatives.
     """
 
     points: Vectors

@@ -148,8 +148,8 @@ class FreeMotion(Value):
     `coupling` maps a step of d = 6 + h numbers, of pose and actuated joints, to the motions. None
     means the identity.
 
-    `product` maps the frames of all links to all m markers in one matrix product. The frames are k
-    = 4 l numbers for each coordinate. The markers come in groups of `sizes`. First come the given
+    `product` maps the frames of all links to all m markers in one matrix product. Each coordinate
+    of the frames has k = 4 l numbers. The markers come in groups of `sizes`. First come the given
     groups, then the origins of all motions, all rotation axes, and all translation axes. One of the
     two axes of a motion is zero.
     """

@@ -315,8 +315,8 @@ def cross_covariance(
     """Return the covariance of distance (first) and gradient (x, y, z) at x with the observations
     at y.
 
-    The q points `x` and n points `y` are normalised. Let d = x - y, and take derivatives by r^2 /
-    2. Then the blocks are k, k' d, -k' d^T and -k' I - k'' d d^T, Eqs. (2)-(5) of the paper. The
+    The q points `x` and n points `y` are normalised. With d = x - y, and derivatives by r^2 / 2,
+    Eqs. (2)-(5) of the paper give the blocks. They are k, k' d, -k' d^T and -k' I - k'' d d^T. The
     last axis holds the distances at all y. Then follows each gradient component at the first
     `n_oriented` points, which have normals. With a leading axis, `y` holds the observations of each
     x.
