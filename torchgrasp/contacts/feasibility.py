@@ -115,9 +115,9 @@ def flatness_constraint(
     normal.
 
     A value is |n - n_k| less the chord of the angle `flatness` [rad]. Here n is the normal at a
-    contact, and n_k are those on a ring around it. It is multiplied by the ring's `radius`, and so
-    is a normalised length. `points` (b, f, 3) are the normalised contacts at which the model is
-    built.
+    contact, and n_k are those on a ring around it. The value is multiplied by the ring's `radius`,
+    and so is a normalised length. `points` (b, f, 3) are the normalised contacts at which the model
+    is built.
     """
     (first, _), *others = walls_at(shape, points)
     found = _wall_constraint(first, points, flatness, radius)

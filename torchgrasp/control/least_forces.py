@@ -74,8 +74,8 @@ class Balance(NamedTuple):
     """The grasp map of f contacts, with its pseudo-inverse and null space.
 
     `wrench` maps the n = 3 f components of the forces on the object to force and torque. The torque
-    is about the contacts' centroid [m]. It has no unit in the first three lines, and [m] in the
-    others. The columns of `inverse` are the least forces for each component of the wrench. The
+    is about the contacts' centroid [m]. `wrench` has no unit in the first three lines, and [m] in
+    the others. The columns of `inverse` are the least forces for each component of the wrench. The
     columns of `free` are an orthonormal basis of the null space: k internal forces, which exert no
     wrench. The columns of `wrench` are 0 for a finger in the air, so its force is free, too.
     """

@@ -107,8 +107,8 @@ def _divide(points: np.ndarray, mask: np.ndarray, reach: float, least: float) ->
 
 
 def _find_creases(points: np.ndarray, mask: np.ndarray, step: int) -> np.ndarray:
-    """Return a mask of the pixels at which the surface bends towards the camera. It is seen over
-    `step` pixels to either side.
+    """Return a mask of the pixels at which the surface bends towards the camera. The bend is seen
+    over `step` pixels to either side.
     """
     width = step | 1
     share = np.maximum(ndimage.uniform_filter(mask.astype(float), width), CREASE.least_share)

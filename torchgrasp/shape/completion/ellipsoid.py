@@ -110,7 +110,7 @@ class _Fit:
     """The least-squares fit of an ellipsoid with 9 parameters.
 
     They are its centre [m], and 6 entries of the logarithm of a symmetric matrix. This matrix maps
-    the unit ball to it.
+    the unit ball to the ellipsoid.
     """
 
     points: np.ndarray
