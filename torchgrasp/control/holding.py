@@ -167,10 +167,10 @@ class GripHold:
     """Hold controller that presses with the least forces against two loads. They are the sensed
     load and a push of `PUSH` from any side.
 
-    Until the lifted load is steady, the forces also allow for a greater weight: the greatest that
-    an object of this size may have. This reserve shrinks where torques or forces would exceed their
-    limits; no force exceeds `reference.max_force`. `status` becomes `TOO_HEAVY` when a fingertip
-    slides although the torques or forces have reached their limits.
+    Until the lifted load is steady, the forces also allow for the greatest weight that an object of
+    this size may have. This reserve shrinks where torques or forces would exceed their limits; no
+    force exceeds `reference.max_force`. `status` becomes `TOO_HEAVY` when a fingertip slides
+    although the torques or forces have reached their limits.
 
     Args:
         reference: the closing plan.

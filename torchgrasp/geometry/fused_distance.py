@@ -63,8 +63,8 @@ def _keep_nearest(squared, index, kept, kept_index):
 
 @inlined
 def _gap_from_triangle(point, corners, least_span):
-    """Return (gap, feature): the vector from the closest point of a triangle to a point, and where
-    the closest point lies, as in `closest_on_triangles`.
+    """Return (gap, feature). The gap is the vector from the closest point of a triangle to a point.
+    The feature says where the closest point lies, as in `closest_on_triangles`.
     """
     u = _minus(corners[1], corners[0])
     v = _minus(corners[2], corners[0])

@@ -1,5 +1,5 @@
-"""Exact signed distances to a triangle mesh, which may be open: to the nearest of a few triangles
-that samples of the surface tell.
+"""Exact signed distances to a triangle mesh, which may be open. They are to the nearest of a few
+triangles that samples of the surface tell.
 """
 
 import dataclasses
@@ -188,8 +188,8 @@ def _pseudonormals(corners: np.ndarray, ids: np.ndarray, face: np.ndarray) -> np
     """Return pseudonormals (Baerentzen and Aanaes, 2005) of each triangle's face, 3 sides and 3
     corners, (f, 7, 3).
 
-    `corners` (f, 3, 3) are those of the triangles, `ids` (f, 3) tell which of them are one vertex,
-    and `face` (f, 3) are the unit normals of the triangles.
+    `corners` (f, 3, 3) are those of the triangles, and `ids` (f, 3) tell which of them are one
+    vertex. `face` (f, 3) are the unit normals of the triangles.
     """
     ahead = np.roll(corners, -1, 1) - corners
     back = np.roll(corners, 1, 1) - corners

@@ -240,7 +240,7 @@ def _fingers(hand: Hand, levers: Float[Tensor, "n f h"]) -> tuple[FingerAbility,
     """
     effort = levers.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
     # the joint that reaches its effort first bounds the force; one without a lever does not, even
-    # with effort 0 (unknown)
+    # with effort 0
     bounds = torch.where(levers == 0, math.inf, effort / levers.abs())
     force = bounds.amin(2)  # (n, f)
     moved = (hand.tree.moves[hand.tips.index] @ hand.actuated.coupling.abs()) > 0  # (f, h)
