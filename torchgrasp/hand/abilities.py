@@ -239,8 +239,8 @@ def _fingers(hand: Hand, levers: Float[Tensor, "n f h"]) -> tuple[FingerAbility,
     are the moves of the contact along its normal.
     """
     effort = levers.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
-    # the joint that reaches its effort first bounds the force; one without a lever does not, even
-    # with effort 0
+    # The joint that reaches its effort first bounds the force. One without a lever does not, even
+    # if its effort is unknown, which is 0.
     bounds = torch.where(levers == 0, math.inf, effort / levers.abs())
     force = bounds.amin(2)  # (n, f)
     moved = (hand.tree.moves[hand.tips.index] @ hand.actuated.coupling.abs()) > 0  # (f, h)
