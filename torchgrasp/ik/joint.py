@@ -12,7 +12,7 @@ import dataclasses
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.contacts.certify import certify
@@ -44,9 +44,9 @@ from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquar
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.attempts import Attempts, assign, best_first, best_grasps, try_best_seeds
 from torchgrasp.ik.candidates import GraspCandidates, GraspProblem, check_candidates
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, clearance_rows
-from torchgrasp.ik.configuration import Configuration, SpatialJacobian, differentiate
-from torchgrasp.ik.refine import HAND_STEP, PAD_WEIGHT, TIP_WEIGHT, tip_rows, tip_targets
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld
+from torchgrasp.ik.configuration import Configuration
+from torchgrasp.ik.refine import HAND_STEP, TIP_WEIGHT, grasp_residuals, tip_targets
 from torchgrasp.shape.estimate import SurfaceJet
 from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 from torchgrasp.values.specs import ContactSpec
@@ -156,15 +156,12 @@ class JointProblem:
         mean = triple_mean_jet(shape, state.points)
         slope = state.variance_gradient
         jet = SurfaceJet(**vars(mean), variance=state.variance, variance_gradient=slope)
-        spatial = SpatialJacobian.at(hand, state.configuration)
         contacts = Contacts(shape.metres(state.points), jet.normals)
-        tips = tip_rows(spatial, tip_targets(hand, contacts), jet.normals)
-        of_hand, by_hand = differentiate(
-            spatial, [tips, *clearance_rows(spatial, self.world, tips_touch=True)]
+        target = tip_targets(hand, contacts)
+        of_hand, by_hand = grasp_residuals(
+            hand, state.configuration, target, jet.normals, self.world, tips_touch=True
         )
-        tips_by_points = self._tips_by_points(
-            spatial, jet, tips.residual[:, 3 * len(hand.tips) :] > 0
-        )
+        tips_by_points = self._tips_by_points(state.configuration, jet, by_hand)
         contact, contact_by_x = self._contact_residuals(state, jet, flat)
 
         # hand and contacts meet only in the tips
@@ -179,22 +176,30 @@ class JointProblem:
         return residual, jacobian
 
     def _tips_by_points(
-        self, spatial: SpatialJacobian, jet: SurfaceJet, outside: Bool[Tensor, "g f"]
-    ) -> Float[Tensor, "g 4*f 3*f"]:
-        """Return the derivatives of tip residuals by contact points; `outside` marks contacts
-        outside their pads' cones.
+        self,
+        configuration: Configuration,
+        jet: SurfaceJet,
+        by_hand: Float[Tensor, "g k h"],
+    ) -> Float[Tensor, "g tips points"]:
+        """Return the derivatives of the 4 f tip residuals by the 3 f coordinates of contact points.
+
+        `by_hand` holds those of all residuals by pose and joints.
         """
-        hand = self.hand
+        tips = self.hand.tips
+        count = len(tips)
         normals = jet.normals
         normal_jacobian = jet.normal_jacobian
-        identity, own = (eye_like(k, normals) for k in (3, len(hand.tips)))
-        rolled = hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
+        identity, own = (eye_like(k, normals) for k in (3, count))
+        rolled = tips.radius.to(normals)[:, None, None] * normal_jacobian
         target = spread(self.shape.scale, rolled) * identity + rolled
-        pads = spatial.pads.permute(2, 1, 0)
-        tilt = (pads[..., None, :] @ normal_jacobian)[..., 0, :] * outside[..., None]
-        tips = torch.einsum("gixy,ij->gixjy", target, own).flatten(3).flatten(1, 2)
+        # a turn of the hand changes the cosine of pad p and normal n by p x n, and n x (p x n) is
+        # the part of p in the tangent plane, in which normals turn; both are 0 inside the cone
+        turn = by_hand[:, 3 * count : 4 * count, 3:6] @ configuration.obj_from_hand[:, :3, :3].mT
+        along = torch.linalg.cross(normals, turn)
+        tilt = (along[..., None, :] @ normal_jacobian)[..., 0, :]
+        moves = torch.einsum("gixy,ij->gixjy", target, own).flatten(3).flatten(1, 2)
         tilts = torch.einsum("giy,ij->gijy", tilt, own).flatten(2)
-        return torch.cat([-TIP_WEIGHT / MILLIMETRE * tips, PAD_WEIGHT * tilts], 1)
+        return torch.cat([-TIP_WEIGHT / MILLIMETRE * moves, tilts], 1)
 
     def _contact_residuals(
         self, state: JointState, jet: SurfaceJet, flat: FlatnessConstraint | None
