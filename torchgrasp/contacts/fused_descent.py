@@ -25,7 +25,7 @@ from torchgrasp.geometry.fused_vectors import (
     solve_factorised,
 )
 from torchgrasp.shape.estimate import SurfaceJet
-from torchgrasp.shape.fused_jets import arrays_of, put_hessian, sum_thin_plate
+from torchgrasp.shape.fused_jets import put_hessian, sum_thin_plate
 from torchgrasp.shape.gp import ShapeGP
 
 NUMBERS = (
@@ -298,6 +298,7 @@ def descend(
         jet.variance_gradient,
     )
     new = [x.clone(memory_format=torch.contiguous_format) for x in fields]
-    thin = arrays_of(shape.weighted)
+    y, a, b, psi = shape.weighted.arrays
+    thin = y, a[0], b[0], psi
     _descend(numbers, thin, array(pairs, torch.int64), array(signs), up, *(x.numpy() for x in new))
     return solver.State(new[0], new[1], SurfaceJet(*new[2:]))

@@ -88,7 +88,10 @@ class Walls(Value):
             others = torch.arange(len(shape.x) - len(oriented), device=x.device)
             place = torch.cat([oriented, near + others])
             rows = torch.cat([place, *(n + k * near + oriented for k in range(3))])
-            x[w, place], a[w, place], b[w, oriented], _ = shape.weighted
+            own = shape.weighted
+            x[w, place] = own.x
+            a[w, place] = own.a
+            b[w, oriented] = own.b
             factor[w, : len(rows), : len(rows)] = shape.factor.to(device)
             # rows of what is missing come last
             missing = torch.ones(size, dtype=torch.bool, device=x.device)

@@ -17,27 +17,28 @@ from torchgrasp.shape.jets import Explain, Weighted
 from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, float]
-"""Observed points (3, n), weights of distances and of normals, and psi."""
+"""Observed points (3, n), weights (1 or q, n) of distances and (1 or q, 3, n) of normals, and psi."""
 
 
 def evaluate_mean(of: Weighted, x: Queries, gradient: bool) -> tuple[Tensor, ...]:
     """Return the mean distance (q,) and, if `gradient` is True, its gradient (q, 3)."""
-    found = _mean(of, x, of.a[None], of.b.T[None], bent=False)
+    found = _mean(of.arrays, x, bent=False)
     return found[:2] if gradient else found[:1]
 
 
 def evaluate_mean_jet(of: Weighted, x: Queries) -> tuple[tuple[Tensor, Tensor, Tensor], None]:
     """Return the fields of `MeanJet`, and None in the place of the kernel's values."""
-    return _mean(of, x, of.a[None], of.b.T[None], bent=True), None
+    return _mean(of.arrays, x, bent=True), None
 
 
 def evaluate_jet(of: Weighted, x: Queries, explain: Explain) -> tuple[Tensor, ...]:
     """Return the fields of `SurfaceJet`."""
-    mean = _mean(of, x, of.a[None], of.b.T[None], bent=True)
+    mean = _mean(of.arrays, x, bent=True)
     near = len(of.b)
     explained, solved = explain(rows_at(of.x, near, of.kernel, x))
     n = len(of.x)
-    slope = _mean(of, x, solved[:, :n], solved[:, n:].unflatten(1, (3, near)), bent=False)[1]
+    own = arrays_of(of, solved[:, :n], solved[:, n:].unflatten(1, (3, near)))
+    slope = _mean(own, x, bent=False)[1]
     variance = of.kernel.profile(x.new_zeros(len(x), 1))[:, 0] - explained
     return *mean, variance, -2.0 * slope
 
@@ -49,28 +50,21 @@ def rows_at(known: Points, near: int, kernel: Kernel, x: Queries) -> CovarianceR
     return found
 
 
-def _mean(
-    of: Weighted,
-    x: Queries,
-    a: Float[Tensor, "#q n"],
-    b: Float[Tensor, "#q 3 near"],
-    bent: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return mean (q,), gradient (q, 3) and, if `bent`, Hessian (q, 3, 3). The weights are `a` of
-    distances and `b` of normals, the same or others for each point.
-    """
+def _mean(arrays: Arrays, x: Queries, bent: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Return mean (q,), gradient (q, 3) and, if `bent`, Hessian (q, 3, 3)."""
     found = x.new_empty(len(x)), x.new_empty(len(x), 3), x.new_empty(len(x) * bent, 3, 3)
-    _sum_at(array(x), *_arrays(of, a, b), *(y.numpy() for y in found))
+    _sum_at(array(x), *arrays, *(y.numpy() for y in found))
     return found
 
 
-def arrays_of(of: Weighted) -> Arrays:
-    """Return the arguments of `sum_thin_plate` but the point: y, a, b and psi."""
-    y, a, b, psi = _arrays(of, of.a[None], of.b.T[None])
-    return y, a[0], b[0], psi
-
-
-def _arrays(of: Weighted, a: Tensor, b: Tensor) -> Arrays:
+def arrays_of(
+    of: Weighted,
+    a: Float[Tensor, "#q n"],
+    b: Float[Tensor, "#q 3 near"],
+) -> Arrays:
+    """Return the arrays of the points of `of` with weights `a` of distances and `b` of normals, the
+    same or others for each query point.
+    """
     shifts = a.new_zeros(len(b), 3, len(of.x))  # points without normals have weight 0
     shifts[..., : b.shape[2]] = b
     return array(of.x.T), array(a), array(shifts), _psi_of(of.kernel)

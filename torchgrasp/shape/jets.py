@@ -3,8 +3,10 @@
 `Posterior.jet` gives the formulas. All is in normalised units.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,7 +16,8 @@ from torchgrasp.geometry.linalg import Points
 from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries, separations
 
 
-class Weighted(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Weighted:
     """The observed points and weights that determine a posterior mean, and the kernel.
 
     The first `near` of n points have normals. With a leading axis q each of q query points has a
@@ -25,6 +28,13 @@ class Weighted(NamedTuple):
     a: Float[Tensor, "*q n"]  # weight of each distance
     b: Float[Tensor, "*q near 3"]  # weight of each normal
     kernel: Kernel
+
+    @cached_property
+    def arrays(self) -> Any:
+        """The same for compiled loops, where all query points have one posterior."""
+        from torchgrasp.shape import fused_jets  # it imports numba
+
+        return fused_jets.arrays_of(self, self.a[None], self.b.mT[None])
 
 
 # `Posterior.explain`, for the points of a chunk
@@ -69,10 +79,12 @@ def evaluate_mean_jet(
 
     `of` holds the observations and weights.
     """
-    known, a, b, kernel = of
+    known = of.x
+    a = of.a
+    b = of.b
     near = b.shape[-2]  # the points with normals come first
     d, r = separations(x, known)
-    k, first, second, third = kernel.derivatives(r, 4)
+    k, first, second, third = of.kernel.derivatives(r, 4)
     near_first = first[:, :near]
     near_second = second[:, :near]
     along = _along_normals(of, x)

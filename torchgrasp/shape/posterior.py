@@ -316,12 +316,12 @@ class Posterior(Value):
 
         return fused_jets
 
-    @property
+    @kept
     def weighted(self) -> Weighted:
         """The observed points, the weights of their distances and normals in the posterior mean,
         and the kernel.
 
-        A named tuple (x, a, b, kernel). `x` (n, 3) are the n observed points, normalised. `a` (n,)
+        Of its fields, `x` (n, 3) are the n observed points, normalised. `a` (n,)
         are the weights of their distances, and `b` (k, 3) those of the k observed normals.
         """
         n = len(self.x)
