@@ -20,14 +20,15 @@ from tests.point_fingers import (
     TARGET,
     TOUCHING,
     observation,
+    on_table,
     real,
     reference,
 )
-from torchgrasp import Plane, Status
+from torchgrasp import Status
 from torchgrasp.control.held_object import FRICTION, FrictionEstimate, likely_body
-from torchgrasp.control.holding import GRIP, PUSH, GripHold, push_reserve
+from torchgrasp.control.holding import PUSH, GripHold, push_reserve
 from torchgrasp.control.least_forces import LeastForces, _Barrier, balance, friction_ratios
-from torchgrasp.control.tactile import Observation
+from torchgrasp.control.tactile import TACTILE, Observation
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.values.distribution import Distribution
@@ -265,6 +266,44 @@ def test_what_the_touches_leave_of_the_friction_contains_the_true_one(prior, fri
     assert found.most - found.least < 0.2
 
 
+def strong_hold(max_force: float | None = None) -> GripHold:
+    """A hold by strong drives, above a table whose normal is the hand's y axis."""
+    strong = {
+        name: drive._replace(effort=8.0) for name, drive in reference().hand.actuators.items()
+    }
+    hand = dataclasses.replace(reference().hand, actuators=strong)
+    known = dataclasses.replace(on_table(max_force=max_force), hand=hand)
+    return GripHold(known, observation(0.0, (2.0, 2.0, 4.0), TOUCHING), torch.zeros(9).double())
+
+
+def loaded(thumb: float, ratio: float, speed: float) -> Observation:
+    """What the fingertips feel of an object that pulls them down by `ratio` of their normal forces.
+
+    The thumb presses with `thumb` [N], each other finger with the half. All slide at `speed` [m/s].
+    """
+    push = thumb * np.array([0.5, 0.5, 1.0])
+    forces = push[:, None] * (ratio * np.array([0.0, 1.0, 0.0]) - OUTWARD)
+    seen = observation(0.0, tuple(push), TOUCHING)
+    tactile = dataclasses.replace(
+        seen.tactile, forces=torch.from_numpy(forces), sliding=torch.full((3,), speed).double()
+    )
+    return dataclasses.replace(seen, tactile=tactile)
+
+
+def estimates(friction: float, speed: float, before: float, ticks: int) -> list[float]:
+    """The estimated friction at each tick after a load has begun to pull the fingertips along the
+    surface with `friction` of their normal forces; for `before` [s] they felt none.
+    """
+    hold = strong_hold()
+    for _ in range(round(before / PERIOD)):
+        hold(loaded(8.0, 0.0, 0.0), PERIOD)
+    found = []
+    for _ in range(ticks):
+        hold(loaded(8.0, friction, speed), PERIOD)
+        found.append(hold.friction.mean)
+    return found
+
+
 @functools.cache
 def carried(
     weight: float, friction: float, max_force: float | None = None, seconds: float = 4.0
@@ -275,15 +314,8 @@ def carried(
     The joints follow at once: what the hand wants is what is felt. A finger slides where that
     exceeds its cone.
     """
-    strong = {
-        name: drive._replace(effort=8.0) for name, drive in reference().hand.actuators.items()
-    }
-    hand = dataclasses.replace(reference().hand, actuators=strong)
-    known = dataclasses.replace(
-        reference(), hand=hand, table=Plane(real([0, 1, 0]), -0.1), max_force=max_force
-    )
+    hold = strong_hold(max_force)
     seen = observation(0.0, (2.0, 2.0, 4.0), TOUCHING)
-    hold = GripHold(known, seen, torch.zeros(9).double())
     sums = []
     for k in range(round(seconds / PERIOD)):
         hold(seen, PERIOD)
@@ -346,10 +378,57 @@ def test_grip_reports_a_load_as_too_heavy_only_if_a_finger_slides():
     assert carried(weight, 0.8, max_force=most)[0].status is Status.TOO_HEAVY
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("friction", [0.4, 0.6])
+def test_a_slip_shows_the_friction_once_the_filtered_forces_have_followed_it(friction):
+    """The filters still hold the smaller forces of before, which would show less friction."""
+    found = estimates(friction, 0.02, 0.5, 8)
+    assert min(found) > 0.85 * friction
+    assert found[-1] == pytest.approx(friction, rel=0.1)
+
+
+def test_a_speed_within_the_noise_of_the_sensor_is_no_slide_and_a_slow_slide_is_one():
+    assert set(estimates(0.5, 2.5 * TACTILE.slide, 0.5, 20)) == {0.8}
+    assert estimates(0.5, 6.0 * TACTILE.slide, 0.5, 20)[-1] == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize(("slip", "status"), [(0.15, Status.OK), (0.5, Status.TOO_HEAVY)])
+def test_a_load_is_too_heavy_if_the_fingers_slide_on_and_not_for_a_moment(slip, status):
+    """They slide at the largest force that is allowed, and stop each time for as long."""
+    hold = strong_hold(max_force=2.0)
+    ticks = round(slip / PERIOD)
+    for k in range(50 + 2 * ticks):
+        slides = k >= 50 and (k - 50) // ticks % 2 == 0
+        hold(loaded(2.0, 1.3, 0.02 * slides), PERIOD)
+    assert hold.strained and hold.status is status
+
+
+@pytest.mark.parametrize("max_force", [1.0, 3.0])
+def test_a_fragile_object_on_its_table_is_pressed_with_most_of_what_it_bears_and_never_with_all(
+    max_force,
+):
+    """It may be too heavy for such a force, and that is no reason to press with all of it."""
+    sums = carried(1.0, 0.8, max_force, seconds=1.0)[2]
+    assert max(sums) < 0.9 * 2 * max_force  # the thumb presses with the half of the sum
+    assert sums[-1] > 0.7 * 2 * max_force
+
+
+@pytest.mark.parametrize("known", [0.8, Distribution.between(0.2, 3.0)])
+def test_a_finger_behind_an_edge_shows_no_friction_beyond_the_largest(known):
+    """Its force may have any direction: here 20 N along the surface, and 4 N into it."""
+    estimate = FrictionEstimate(known)
+    largest = max(Distribution.of(known).most, FRICTION.most)
+    for _ in range(5):
+        estimate.update(5.0, 4.0, slides=False)
+        estimate.update(5.0, 40.0, slides=False)
+    assert 1.0 < estimate.mean <= largest
+    assert estimate.held < largest and estimate.posterior.most <= largest
+
+
 @pytest.mark.parametrize("sideways", [slice(0, 1), slice(0, 3)])
 @pytest.mark.parametrize("max_force", [None, 2.0])
-def test_grip_floors_stay_finite_for_a_planned_force_along_the_surface(sideways, max_force):
+def test_a_grip_whose_planned_forces_are_along_the_surface_keeps_the_largest_force(
+    sideways, max_force
+):
     """A finger in the air keeps the planned forces; the sensed normals of the others may be across
     them.
     """
@@ -362,9 +441,10 @@ def test_grip_floors_stay_finite_for_a_planned_force_along_the_surface(sideways,
     known = dataclasses.replace(reference(), max_force=max_force)
     seen = dataclasses.replace(seen, tactile=tactile)
     hold = GripHold(known, seen, torch.zeros(9).double())
-    floor = hold._bounded(np.maximum(hold.grip, GRIP.least_push))
-    assert np.isfinite(floor).all() and (floor > 0).all()
-    assert max_force is not None or (floor >= GRIP.least_push).all()
+    for _ in range(60):
+        assert torch.isfinite(hold(seen, PERIOD)).all()
+        push = -(hold.sent * hold.normals).sum(-1)
+        assert max_force is None or push.max() < (1 + 1e-9) * max_force
 
 
 @pytest.mark.parametrize("weight", [1.5, 4.0])

@@ -86,7 +86,7 @@ class FrictionEstimate:
     """A running estimate of the friction coefficient, common to all fingertips.
 
     `mean` is the estimate, `std` its standard deviation, and `least` a lower bound of the
-    coefficient.
+    coefficient. `most` is the largest coefficient that is believed.
 
     Args:
         prior: the coefficient that the grasp was planned for. A distribution gives mean and
@@ -112,8 +112,10 @@ class FrictionEstimate:
 
         `ratio` is its tangential over its normal force, `force` [N] its normal force, and `slides`
         says whether it slides. A fingertip that sticks shows that friction is at least its ratio. A
-        slide with a ratio below `least` is taken for a spin about the normal, and ignored.
+        slide with a ratio below `least` is taken for a spin about the normal, and ignored. A ratio
+        above `most` is that of a finger behind an edge, and counts as `most`.
         """
+        ratio = min(ratio, self.most)
         noise = FRICTION.noise * math.hypot(1.0, ratio) / force
         if not slides:
             self.held = max(self.held, ratio - FRICTION.sure * noise)

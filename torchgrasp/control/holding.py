@@ -60,8 +60,6 @@ class GripNumbers:
     """Speed [m/s] of a fingertip along the surface above which it slides."""
     slide: float = 0.03
     """Time [s] of sliding after which the filtered forces show the friction."""
-    ratio: float = 2.0
-    """Largest ratio of tangential to normal force that the friction estimate sees."""
     release: float = 3.0
     """Rate [1/s] at which forces that are not needed fall once the load is steady."""
     changes: float = 2.0
@@ -296,7 +294,7 @@ class GripHold:
         fingers = zip(ratios.tolist(), push.tolist(), self.sliding.tolist(), strict=True)
         for ratio, force, slides in fingers:
             if force > 0.5 * GRIP.least_push:
-                self.friction.update(min(ratio, GRIP.ratio), force, slides)
+                self.friction.update(ratio, force, slides)
         if self.load.settles(period):
             # the closing's forces and the reserve for an unknown weight are no longer needed
             kept = 1 - min(GRIP.release * period, 1.0)
