@@ -225,3 +225,52 @@ def test_an_object_partly_hidden_is_less_easy(label):
         order_by_ease(dataclasses.replace(scene, labels=torch.where(hidden, 0, scene.labels)))[-1]
         == label
     )
+
+
+@pytest.mark.parametrize(("stray", "cut"), [(3, False), (12, True)])
+def test_a_few_pixels_at_the_border_are_noise_and_cut_no_object_off(stray, cut):
+    """An object of 100 x 10 pixels is parallel to the lower border of the image, and near it."""
+    scene = see(BOX)
+    row, column = scene.pixels.T
+    row = scene.image.depth.shape[0] - 1 - row
+    inside = (row > 2) & (row <= 12) & (column >= 60) & (column < 160)
+    some = torch.linspace(60, 159, stray).round().long()
+    inside |= (row == 0) & torch.isin(column, some)
+    scene = dataclasses.replace(scene, labels=inside.long(), table=None)
+    assert (judge_things(scene, HAND)[1] is Status.CUT_OFF) == cut
+
+
+@pytest.fixture
+def unclear(monkeypatch):
+    """Scenes in which the camera sees all objects equally well."""
+    monkeypatch.setattr("torchgrasp.planner.graspable._clarity", lambda scene, pixels: 0.0)
+
+
+@pytest.mark.parametrize(("gap", "place"), [(0.08, 2), (0.03, 0)])
+def test_free_space_makes_an_object_easier_up_to_what_a_hand_needs(unclear, gap, place):
+    """A low box far from all others competes with two taller ones that leave a gap [m]."""
+    low = (0.0, -0.2, 0.06, 0.05)
+    scene = see(low, (0.0, 0.03, 0.06, 0.07), (0.0, 0.09 + gap, 0.06, 0.07))
+    assert order_by_ease(scene).index(1) == place
+
+
+@pytest.mark.parametrize(("heights", "taller_first"), [((0.03, 0.06), True), ((0.1, 0.2), False)])
+def test_height_makes_an_object_easier_up_to_what_a_hand_needs(unclear, heights, taller_first):
+    """Objects that are equally easy keep the order of their labels."""
+    low, tall = heights
+    scene = see((0.0, -0.15, 0.06, low), (0.0, 0.15, 0.06, tall))
+    swapped = dataclasses.replace(scene, labels=(3 - scene.labels) % 3)
+    assert order_by_ease(scene) == ([2, 1] if taller_first else [1, 2])
+    assert order_by_ease(swapped) == [1, 2]
+
+
+@pytest.mark.parametrize(("slab", "place"), [((0.054, 0.06), -1), ((0.0, 0.012), 0)])
+def test_a_quarter_of_an_object_under_another_is_worse_than_a_neighbour_and_a_corner_is_not(
+    unclear, slab, place
+):
+    """A slab hangs over the first box; two others leave 25 mm between each other."""
+    x, width = slab
+    pair = (0.0, -0.1, 0.06, 0.05), (0.0, -0.185, 0.06, 0.05)
+    scene = see((0.0, 0.2, 0.06, 0.05), (x, 0.2, width, 0.01, 0.15), *pair)
+    order = [label for label in order_by_ease(scene) if label != 2]
+    assert order[place] == 1

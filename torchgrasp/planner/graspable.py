@@ -17,6 +17,7 @@ from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import to_upright, upright_frame
 from torchgrasp.geometry.support_search import find_table
 from torchgrasp.hand.hand import Hand
+from torchgrasp.scene.image import IMAGE
 from torchgrasp.scene.scene import Scene
 from torchgrasp.scene.segment import SEGMENT
 from torchgrasp.shape.gp import ShapeGP
@@ -35,8 +36,6 @@ class JudgeNumbers:
     """Quantile of the heights of an object's points that is its top."""
     high: float = 0.9
     """Quantile of the heights of an object's points that must be high enough for fingertips."""
-    border: int = 5
-    """Least number of pixels at the image border of an object that is cut off; fewer are noise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +149,7 @@ def _is_cut(pixels: Tensor, shape: tuple[int, ...]) -> bool:
     for axis in (0, 1):
         for depth in (pixels[:, axis], shape[axis] - 1 - pixels[:, axis]):
             along = pixels[depth <= 1, 1 - axis]
-            if len(along) < JUDGE.border:
+            if len(along) < IMAGE.border_pixels:
                 continue
             if int(along.max() - along.min()) > int(depth.max()):
                 return True
