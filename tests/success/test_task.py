@@ -2,11 +2,15 @@
 
 import math
 
+import numpy as np
 import pytest
+import torch
 
+from tests.make import directions
 from torchgrasp import GraspTask
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.success.task import TaskName, loads_of
 from torchgrasp.values.specs import TrialSpec
 
 
@@ -61,3 +65,39 @@ def test_a_hand_presses_as_told_grips_in_a_lift_and_presses_a_little_in_pulls():
     assert (
         GraspTask().pressing(True) == 0.0 and GraspTask().pressing(False) == TrialSpec().strongest
     )
+
+
+@pytest.fixture
+def resisted():
+    """Tell which forces (n, 3) [N] a grasp of a body of 0.4 kg resists that resists a named task.
+
+    They are the convex hull of the task's loads.
+    """
+    from scipy.spatial import ConvexHull
+
+    def inside(name: TaskName, forces: np.ndarray) -> np.ndarray:
+        eye = torch.eye(4, dtype=torch.float64)
+        loads = loads_of(name, 0.4, torch.zeros(3, dtype=torch.float64), eye, table=True)
+        assert not loads[:, 3:].any()
+        planes = ConvexHull(loads[:, :3].numpy()).equations  # normals, and offsets
+        return (forces @ planes[:, :3].T + planes[:, 3] < 1e-9).all(1)
+
+    return inside
+
+
+def test_who_pours_resists_the_weight_at_any_tilt_up_to_120_degrees_and_no_pull_upward(resisted):
+    tilts = directions(2000).numpy()
+    tilts = tilts[tilts[:, 2] <= math.cos(math.radians(60))]
+    weight = 0.4 * 9.81
+    assert resisted("pour", weight * tilts).all()
+    assert not resisted("pour", 1.25 * weight * tilts).any()
+    assert not resisted("pour", np.array([[0.0, 0.0, weight]])).any()
+
+
+def test_who_is_pushed_resists_the_weight_with_a_force_of_two_and_a_half_newtons_from_any_side(
+    resisted,
+):
+    weight = np.array([0.0, 0.0, -0.4 * 9.81])
+    pushes = 2.5 * directions(2000).numpy()
+    assert resisted("push", weight + pushes).all()
+    assert not resisted("push", weight + 1.25 * pushes).any()
