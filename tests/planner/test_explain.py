@@ -157,6 +157,30 @@ def test_what_cannot_be_changed_is_not_offered():
 
 
 @pytest.mark.parametrize(
+    ("present", "offered"), [(0.1, [0.4, 0.8]), (0.5, [0.8, 1.2]), (0.6, [1.2]), (0.9, [])]
+)
+def test_the_next_two_materials_are_offered_whose_friction_is_clearly_higher(present, offered):
+    """They are smooth plastic, rubber and soft silicone."""
+    offers = changes(spec=ContactSpec(friction=present))
+    frictions = [x.spec.friction for words, x in offers.items() if "friction were" in words]
+    assert frictions == offered
+
+
+@pytest.mark.parametrize(
+    ("field", "usual", "most"), [("max_variance", 0.05, 0.1), ("flatness", 0.6, 0.9)]
+)
+def test_a_limit_beyond_the_usual_one_is_relaxed_once_more(field, usual, most):
+    """At its largest value hardly any contact is refused, and no change is offered."""
+
+    def offered(value: float) -> list[float]:
+        found = changes(spec=ContactSpec(**{field: value}))
+        return [getattr(x.spec, field) for words, x in found.items() if f"with {field}=" in words]
+
+    assert offered(usual) == [most]
+    assert offered(most) == []
+
+
+@pytest.mark.parametrize(
     ("plan", "grasps", "first"),
     [
         ([Status.NOT_CLOSED] * 9, [], "fingers"),
