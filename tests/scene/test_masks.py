@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.make import box
+from tests.make import box, see
 from torchgrasp import Scene, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.foundation.errors import BadArgument
@@ -221,3 +221,71 @@ def test_labels_of_the_table_and_an_inverted_mask_are_told():
     )
     told = Scene.from_depth(depth, INTRINSICS, pose, mask=labels != 1).notes
     assert any("is it inverted?" in note for note in told)
+
+
+@pytest.fixture(scope="module")
+def small_and_large():
+    """The scene of two boxes, the second of which fills about four times as many pixels."""
+    scene = see((0.0, -0.1, 0.04, 0.05), (0.0, 0.1, 0.09, 0.1))
+    small, large = (int(scene.rows_of(label).sum()) for label in (1, 2))
+    assert 3 * small < large < 6 * small
+    return scene
+
+
+def parts(scene: Scene, *shares: float) -> torch.Tensor:
+    """The mask of given shares of the measured pixels of the table, the first and the second box;
+    they are the first pixels, column by column.
+    """
+    mask = torch.zeros_like(scene.pixel_labels, dtype=torch.bool)
+    for label, share in enumerate(shares):
+        own = (scene.pixel_labels == label) & (scene.image.depth > 0)
+        column, row = torch.nonzero(own.T).T
+        count = round(share * len(row))
+        mask[row[:count], column[:count]] = True
+    return mask
+
+
+def masked(scene: Scene, mask: torch.Tensor) -> Scene:
+    """The scene of the same image with a mask of the target."""
+    image = scene.image
+    return Scene.from_depth(
+        image.depth, image.intrinsics, image.obj_from_camera, mask=mask, table=scene.table
+    )
+
+
+@pytest.mark.parametrize(
+    ("small", "large", "taken"),
+    [
+        (0.8, 1.0, {1, 2}),  # most of the small box
+        (0.3, 1.0, {2}),
+        (1.0, 0.3, {1, 2}),  # it is half of the mask
+        (1.0, 0.06, {1}),
+    ],
+)
+def test_a_mask_takes_the_objects_that_it_mostly_covers_or_that_fill_much_of_it(
+    small_and_large, small, large, taken
+):
+    found = masked(small_and_large, parts(small_and_large, 0.0, small, large))
+    # a few pixels lie at jumps of depth
+    counts = small_and_large.pixel_labels[found.pixel_labels == 1].bincount(minlength=3)
+    assert {k for k in (1, 2) if counts[k] > 0.01 * counts.sum()} == taken
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.03, True), (0.1, False)])
+def test_a_mask_of_the_table_with_a_little_of_an_object_is_refused(small_and_large, share, refused):
+    """Half of the measured table is in the mask."""
+    table, _, large = small_and_large.pixel_labels[small_and_large.image.depth > 0].bincount()
+    mask = parts(small_and_large, 0.5, 0.0, 0.5 * float(table / large) * share / (1 - share))
+    if refused:
+        with pytest.raises(BadArgument, match=r"mask: .* this target is the table"):
+            masked(small_and_large, mask)
+    else:
+        assert masked(small_and_large, mask).target == 1
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.03, False), (0.1, True)])
+def test_table_in_a_mask_is_told_where_it_is_more_than_a_rim(small_and_large, share, told):
+    table, _, large = small_and_large.pixel_labels[small_and_large.image.depth > 0].bincount()
+    mask = parts(small_and_large, share * float(large / table), 0.0, 1.0)
+    notes = masked(small_and_large, mask).notes
+    assert any("lie on the support and were removed" in note for note in notes) == told
