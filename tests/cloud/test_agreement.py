@@ -13,12 +13,14 @@ from torchgrasp.cloud.agreement import (
     check_contacts,
     check_foot,
     check_mesh,
+    check_seen,
     check_stand,
     warn_of_low_table,
 )
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument, CloudWarning, NoEffect
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
 
@@ -88,6 +90,27 @@ def test_contacts_on_the_hidden_side_agree_and_contacts_elsewhere_do_not(camera)
     if camera:  # in space that the camera saw to be free
         with pytest.raises(BadArgument):
             check_agreement("FILE", towards_camera, "contacts", cloud, 0.03, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("away", "count", "told"),
+    [(0.015, 3, False), (0.06, 3, True), (0.06, 1, False), (0.06, 2, True)],
+)
+def test_grasps_are_refused_half_of_whose_contacts_are_before_all_that_the_camera_saw(
+    away, count, told
+):
+    """One contact of three may lie on a side that nobody saw."""
+    cloud = view()
+    distance = (cloud.points - cloud.viewpoint).norm(dim=-1)
+    points = cloud.points[distance.argsort()[:3]]
+    points[:count] -= away * unit(points[:count] - cloud.viewpoint)
+    grasp = load_shipped_grasp("jug", "barrett")
+    contacts = dataclasses.replace(grasp.contacts, points=points[None].to(grasp.contacts.points))
+    grasp = dataclasses.replace(grasp, contacts=contacts)
+    if not told:
+        return check_seen(grasp, cloud, "FILE")
+    with pytest.raises(BadArgument, match=r"FILE: expected the contacts within 30 mm of the cloud"):
+        check_seen(grasp, cloud, "FILE")
 
 
 def misplaced(way):
