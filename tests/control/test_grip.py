@@ -26,7 +26,7 @@ from tests.point_fingers import (
 )
 from torchgrasp import Status
 from torchgrasp.control.held_object import FRICTION, FrictionEstimate, LoadEstimate, likely_body
-from torchgrasp.control.holding import PUSH, GripHold, push_reserve
+from torchgrasp.control.holding import PUSH, RAMP, GripHold, push_reserve
 from torchgrasp.control.least_forces import LeastForces, _Barrier, balance, friction_ratios
 from torchgrasp.control.tactile import TACTILE, Observation
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere
@@ -290,12 +290,12 @@ def loaded(thumb: float, ratio: float, speed: float) -> Observation:
     return dataclasses.replace(seen, tactile=tactile)
 
 
-def estimates(friction: float, speed: float, before: float, ticks: int) -> list[float]:
+def estimates(friction: float, speed: float, ticks: int) -> list[float]:
     """The estimated friction at each tick after a load has begun to pull the fingertips along the
-    surface with `friction` of their normal forces; for `before` [s] they felt none.
+    surface with `friction` of their normal forces; until the ramp was over, they felt none.
     """
     hold = strong_hold()
-    for _ in range(round(before / PERIOD)):
+    for _ in range(round(RAMP / PERIOD) + 1):
         hold(loaded(8.0, 0.0, 0.0), PERIOD)
     found = []
     for _ in range(ticks):
@@ -381,14 +381,14 @@ def test_grip_reports_a_load_as_too_heavy_only_if_a_finger_slides():
 @pytest.mark.parametrize("friction", [0.4, 0.6])
 def test_a_slip_shows_the_friction_once_the_filtered_forces_have_followed_it(friction):
     """The filters still hold the smaller forces of before, which would show less friction."""
-    found = estimates(friction, 0.02, 0.5, 8)
+    found = estimates(friction, 0.02, 8)
     assert min(found) > 0.85 * friction
     assert found[-1] == pytest.approx(friction, rel=0.1)
 
 
 def test_a_speed_within_the_noise_of_the_sensor_is_no_slide_and_a_slow_slide_is_one():
-    assert set(estimates(0.5, 2.5 * TACTILE.slide, 0.5, 20)) == {0.8}
-    assert estimates(0.5, 6.0 * TACTILE.slide, 0.5, 20)[-1] == pytest.approx(0.5, abs=0.02)
+    assert set(estimates(0.5, 2.5 * TACTILE.slide, 10)) == {0.8}
+    assert estimates(0.5, 6.0 * TACTILE.slide, 10)[-1] == pytest.approx(0.5, abs=0.05)
 
 
 @pytest.mark.parametrize(("slip", "status"), [(0.15, Status.OK), (0.5, Status.TOO_HEAVY)])
@@ -461,8 +461,8 @@ def test_a_load_that_is_too_heavy_bounds_the_mass_below():
     assert hold.mass.least > 0.1
 
 
-@pytest.mark.parametrize(("weight", "ticks"), [(2.0, 10), (20.0, 30)])
-def test_the_interval_of_the_mass_holds_it_in_nineteen_of_twenty_lifts(weight, ticks):
+@pytest.mark.parametrize("weight", [2.0, 20.0])
+def test_the_interval_of_the_mass_holds_it_in_nineteen_of_twenty_lifts(weight):
     """Single readings have noise of 0.5 N; motion and oblique contacts change a whole lift's load
     by a twentieth.
     """
@@ -472,7 +472,7 @@ def test_the_interval_of_the_mass_holds_it_in_nineteen_of_twenty_lifts(weight, t
         estimate = LoadEstimate(np.array([0.0, 0.0, 1.0]), PUSH)
         estimate.steady = True
         load = weight * (1 + 0.05 * generator.normal())
-        for noise in 0.5 * generator.normal(size=ticks):
+        for noise in 0.5 * generator.normal(size=10):
             estimate.update(np.array([0.0, 0.0, load + noise, 0.0, 0.0, 0.0]), 0.02)
         assert estimate.mass is not None
         found += estimate.mass.least < weight / 9.81 < estimate.mass.most
