@@ -44,7 +44,7 @@ def seen_block(n=400, seed=0):
     "pose", [None, rigid(rotation_from_vector(real([0.4, -1.0, 2.0])), real([0.5, -0.2, 0.1]))]
 )
 @pytest.mark.parametrize(
-    ("shift", "turn"), [((0, 0), 0), ((0.06, -0.03), 0.3), ((-0.02, 0.075), -0.4)]
+    ("shift", "turn"), [((0, 0), 0), ((0.08, -0.08), 0.52), ((-0.02, 0.075), -0.4)]
 )
 def test_relocate_finds_the_motion_of_a_block_in_any_frame(shift, turn, pose):
     pose = torch.eye(4).double() if pose is None else pose
