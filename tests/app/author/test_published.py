@@ -186,6 +186,38 @@ def test_frames_wrist_and_masses(claw):
     assert_same_links(hand, claw)
 
 
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_wrist_of_followers_is_fixed_in_any_order_of_the_file(claw, reverse):
+    """The third joint follows the second, which follows the first, and a finger follows the third."""
+    joints = []
+    last = "base"
+    for k, mimic in ((3, ("w2", 2, 0.1)), (2, ("w1", -1, 0.3)), (1, None)):
+        follow = '<mimic joint="{}" multiplier="{}" offset="{}"/>'.format(*mimic) if mimic else ""
+        joints.append(
+            f'<link name="w{k}"/><joint name="w{k}" type="revolute"><parent link="w{k}"/>'
+            f'<child link="{last}"/><origin xyz="0 0 0.05"/><axis xyz="{k == 3:d} {k == 2:d} {k == 1:d}"/>'
+            f'<limit lower="{0.2 if k == 1 else -2}" upper="2" effort="1" velocity="1"/>{follow}</joint>'
+        )
+        last = f"w{k}"
+    joints = joints[::-1] if reverse else joints
+    swivel = '<joint name="left_swivel" type="revolute">'
+    change(claw, (END, "".join(joints) + END))
+    change(claw, (swivel, swivel + '<mimic joint="w3" multiplier="0.5"/>'))
+    hand, told = made(claw)
+    # w1 stands at its lower limit
+    w1 = 0.2
+    w2 = -w1 + 0.3
+    w3 = 2 * w2 + 0.1
+    for words in (
+        "w1 at 0.2",
+        f"w2 at {w2:.4g}",
+        f"w3 at {w3:.4g}",
+        f"left_swivel at {w3 / 2:.4g}",
+    ):
+        assert words in told, told
+    assert "left_swivel" not in hand.tree.joint_names
+
+
 def test_an_arm_above_the_hand_is_left_out(claw):
     """By itself from four common joints on, or by the root that is named."""
     links = "".join(f'<link name="arm{k}"/>' for k in range(5))

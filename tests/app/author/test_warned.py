@@ -212,6 +212,31 @@ def test_numbers_that_no_hand_has_are_named(claw, old, new, words):
     assert any(re.search(words, x) for x in told)
 
 
+def test_two_ends_of_one_finger_are_no_two_fingers(claw):
+    """A finger with two ends is one finger, unless the user names both."""
+    ends = with_links(claw, fixed("left_far", "left_nail", "0.01 0.01 0.01", "0.01 0.015 0.04"))
+    with pytest.raises(BadArgument, match="left_tip and left_nail, two ends of one finger"):
+        new_hand(ends)
+    assert '"left_nail"' in new_hand(ends, Wish(tips=("left_nail", "right_tip", "thumb_tip"))).toml
+
+
+def test_two_hands_in_one_urdf_are_told_and_the_root_chooses_one(claw):
+    """Two grippers of two fingers are no hand of four fingers."""
+    text = re.sub(r'<(link|joint) name="right_.*?</\1>', "", claw.read_text())
+    inner = text[text.index(">") + 1 : text.rindex("</robot>")]
+    base = '<link name="torso"/>'
+    for side, y in (("l", 0.3), ("r", -0.3)):
+        base += re.sub(r'(name|link|joint)="(\w+)"', rf'\1="{side}_\2"', inner)
+        base += f'<joint name="{side}" type="fixed"><parent link="torso"/>'
+        base += f'<child link="{side}_base"/><origin xyz="0 {y} 0"/></joint>'
+    claw.write_text(f'<robot name="both">{base}</robot>')
+    (told,) = [x for x in new_hand(claw).warnings if "two hands (--root)" in x]
+    # the farthest two of its fingers
+    assert "l_thumb_swivel and r_left_swivel 0.636" in told
+    with pytest.raises(BadArgument, match="a hand of 2 fingers"):
+        new_hand(claw, Wish(root="l_base"))
+
+
 def test_a_draft_names_them_in_its_file(claw):
     claw.write_text(re.sub(r'effort="[\d.]+"', 'effort="10000"', claw.read_text()))
     draft = new_hand(claw)

@@ -7,6 +7,7 @@ A published URDF is repaired (`repair`), and its meshes are replaced by simple s
 
 import dataclasses
 import functools
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -64,6 +65,9 @@ class DraftNumbers:
     rotor: float = 1e-3  # inertia [kg m2] that simulations add to each joint
     stiffness: float = 4.0  # stiffness of a drive [1/rad], over the effort of the weakest joint
     most_stiffness: float = 10.0  # greatest stiffness of a drive [N m/rad]
+    # the same of a hand whose joints all slide: the whole effort moves a fingertip by 10 mm
+    slide_stiffness: float = 100.0  # [1/m], over the effort of the weakest joint
+    most_slide_stiffness: float = 1e4  # [N/m]
     damping: float = 0.03  # least time constant [s]: the ratio of damping to stiffness
     trials: int = 1000  # random postures of each set of fingers in which a free one is sought
     # Pairs of links are left out if fewer than this share of postures is free. They are pairs that
@@ -244,7 +248,7 @@ def _draft(
             f"links with a <visual> but no <collision> touch nothing: {', '.join(bare)} "
             "(--visual takes their <visual>)"
         )
-    warnings += _thin_tips(tips, surfaces)
+    warnings += _thin_tips(tips, surfaces) + _mixed_joints(clean)
 
     options = _options(clean, sets)
     pairs, without = _part_pairs(clean, options, seed)
@@ -353,6 +357,18 @@ def _thin_tips(tips: tuple[str, ...], surfaces: dict[str, np.ndarray]) -> list[s
         return []
     sizes = ", ".join(thin)
     return [f"fingertips are thinner than fingers, are they others (--tips)? {sizes}"]
+
+
+def _mixed_joints(urdf: Urdf) -> list[str]:
+    """Return a warning, or none, that names the sliding joints of a hand whose other joints turn."""
+    free = [j for j in urdf.movable if j.mimic is None]
+    slides = [j.name for j in free if j.kind == "prismatic"]
+    if not slides or len(slides) == len(free):
+        return []
+    names = ", ".join(slides)
+    return [
+        f"kp and kd are those of joints that turn; in N/m they are weak for joints that slide: {names}"
+    ]
 
 
 def _part_pairs(
@@ -469,6 +485,8 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...], bare: tuple[str, ...]) -> t
             "three to five different links in grasp order; "
             f"the branches of {urdf.path} end in {list(ends)}"
         )
+        if len(ends) > FINGERTIPS[1]:
+            wanted += "; --root chooses one of several hands"
         if bare:
             wanted += f"; --visual takes the <visual> of links without <collision>: {list(bare)}"
         raise BadArgument("tips", list(tips) or f"a hand of {len(ends)} fingers", wanted)
@@ -477,6 +495,11 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...], bare: tuple[str, ...]) -> t
         if tip not in shaped or not urdf.movers(tip):
             wanted = f"links with a collision shape that joints move, such as {list(ends)}"
             raise BadArgument("tips", tip, wanted)
+    for one, two in () if tips else itertools.combinations(chosen, 2):
+        if urdf.movers(one) == urdf.movers(two):
+            found = f"{one} and {two}, two ends of one finger"
+            allowed = f"three to five of {list(ends)}, one of each finger"
+            raise BadArgument("tips", found, allowed)
     return chosen
 
 
@@ -487,24 +510,28 @@ def _coupling(urdf: Urdf) -> dict[str, Mimic]:
 def _gains(urdf: Urdf) -> tuple[float, float]:
     """Return stiffness [N m/rad] and damping [N m s/rad] for the drives, similar to those of the
     shipped hands.
+
+    They are in [N/m] and [N s/m] if all independent joints slide.
     """
     free = [j for j in urdf.movable if j.mimic is None]
-    kp = min(DRAFT.stiffness * min(j.effort for j in free), DRAFT.most_stiffness)
+    turning = [j for j in free if j.kind != "prismatic"]
+    kp = min(DRAFT.slide_stiffness * min(j.effort for j in free), DRAFT.most_slide_stiffness)
+    if turning:
+        kp = min(DRAFT.stiffness * min(j.effort for j in turning), DRAFT.most_stiffness)
     zero = torch.zeros(1, len(urdf.movable), dtype=torch.float64)
     poses = tree_from_urdf(urdf).poses(zero)[0].numpy()  # (l, 4, 4)
     names = [x.name for x in urdf.links]
     placed = zip(poses, urdf.links, strict=True)
     centres = np.array([pose[:3, :3] @ x.com + pose[:3, 3] for pose, x in placed])
-    # greatest inertia that a joint turns, of all links beyond it as points
+    # greatest inertia that a joint turns, of all links beyond it as points; or mass that one slides
     heaviest = 0.0
-    for j in free:
-        if j.kind == "prismatic":
-            continue
+    for j in turning or free:
         pose = poses[names.index(j.child)]
         moved = [k for k, name in enumerate(names) if j in urdf.joints_above(name)]
         arms = np.cross(pose[:3, :3] @ j.axis, centres[moved] - pose[:3, 3])
+        weights = (arms**2).sum(1) if turning else np.ones(len(moved))
         masses = np.array([urdf.links[k].mass for k in moved])
-        heaviest = max(heaviest, float(masses @ (arms**2).sum(1)))
+        heaviest = max(heaviest, float(masses @ weights))
     critical = 2 * np.sqrt(kp * (heaviest + DRAFT.rotor))
     return kp, max(DRAFT.damping * kp, critical)
 
@@ -533,6 +560,7 @@ def _toml_text(
         approach=approach,
         kp=kp,
         kd=kd,
+        slides=all(j.kind == "prismatic" for j in urdf.movable if j.mimic is None),
         coupling=_coupling(urdf),
         options=options,
         pads=pads,

@@ -355,10 +355,20 @@ class ModelHand:
             low, high = self._range(j, pulls[:, column])
             found[j] = Drive(low, high, effort)
         index = {self.joint_names[j]: j for j in self.joints}
+        moved = {j: bool(pulls[:, column].any()) for column, j in enumerate(self.joints)}
+        # a leader without a motor is as strong as the motors of its followers make it
+        weak = {j for j, drive in found.items() if not moved[j] and not drive.effort}
+        for name, mimic in mechanism.followers.items():
+            pulling = found[index[name]].effort if moved[index[name]] else 0.0
+            for source, ratio in mimic.terms:
+                j = index[source]
+                if j in weak:
+                    effort = found[j].effort + abs(ratio) * pulling
+                    found[j] = dataclasses.replace(found[j], effort=effort)
         # a follower without a motor is as strong as its weakest leader makes it
         for name, mimic in mechanism.followers.items():
             j = index[name]
-            if found[j].effort or pulls[:, self.joints.index(j)].any():
+            if found[j].effort or moved[j]:
                 continue
             given = [found[index[source]].effort / abs(x) for source, x in mimic.terms]
             found[j] = dataclasses.replace(found[j], effort=min(given))

@@ -21,6 +21,9 @@ class RepairNumbers:
     # drive of a joint for which the URDF declares none, typical of small hands
     effort: float = 1.0  # greatest torque [N m]
     velocity: float = 3.0  # greatest speed [rad/s]
+    # the same of a sliding joint, which presses as that torque does at a finger of 0.1 m
+    force: float = 10.0  # greatest force [N]
+    speed: float = 0.1  # greatest speed [m/s], of grippers
     most_wrist: int = 3  # joints that move all fingertips: more are an arm
     marker: float = 6e-3  # a fixed end link is a marker if smaller [m]: no fingertip is so small
     # least mass and edge of a body without mass, so that simulators remain stable
@@ -218,6 +221,10 @@ def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
         return urdf, [f"{arm}: {done[0]}"]
     if not common:
         return urdf, []
+    # in a chain of followers the file may have any order: each follows its leader directly
+    direct = {j.name: j for j in urdf.joints}
+    _follow_directly(direct)
+    urdf = dataclasses.replace(urdf, joints=tuple(direct.values()))
     at = {j.name: j.rest for j in common}
     # joints that follow a wrist joint are fixed where it puts them
     kept = {}
@@ -284,11 +291,14 @@ def _add_drives(joints: dict[str, Joint]) -> list[str]:
     movable = [j for j in joints.values() if j.kind != "fixed"]
     told = dict[str, list[str]]()
     for j in movable:
-        effort = j.effort if j.effort > 0 else REPAIRS.effort
-        velocity = j.velocity if j.velocity > 0 else REPAIRS.velocity
+        slides = j.kind == "prismatic"
+        usual = (REPAIRS.force, REPAIRS.speed) if slides else (REPAIRS.effort, REPAIRS.velocity)
+        units = ("N", "m/s") if slides else ("N m", "rad/s")
+        effort = j.effort if j.effort > 0 else usual[0]
+        velocity = j.velocity if j.velocity > 0 else usual[1]
         joints[j.name] = dataclasses.replace(j, effort=effort, velocity=velocity)
-        gets = [f"{effort:g} N m"] if effort != j.effort else []
-        gets += [f"{velocity:g} rad/s"] if velocity != j.velocity else []
+        gets = [f"{effort:g} {units[0]}"] if effort != j.effort else []
+        gets += [f"{velocity:g} {units[1]}"] if velocity != j.velocity else []
         if gets:
             told.setdefault(", ".join(gets), []).append(j.name)
     return [

@@ -4,12 +4,14 @@ They are placeholders, or in another unit. Nothing is changed: the sentences are
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from torchgrasp.hand.urdf import Urdf
+from torchgrasp.app.author.repair import pose_of
+from torchgrasp.hand.urdf import Joint, Urdf
 
 Bounds = tuple[float, float]  # the least and the greatest usual value
 
@@ -23,6 +25,10 @@ class UsualNumbers:
 
     size: Bounds = (1e-3, 0.6)  # longest edge of a link [m]: a forearm is the largest
     place: Bounds = (0.0, 0.6)  # distance of a joint from the joint before it [m]
+    apart: Bounds = (
+        0.0,
+        0.3,
+    )  # distance of the first joints of two fingers [m]: more are two hands
     turn: Bounds = (0.05, 3.6)  # range of a revolute joint [rad]: half a turn and some degrees
     slide: Bounds = (1e-3, 0.2)  # range of a sliding joint [m]
     # effort of a revolute joint [N m]: more is a placeholder, or in N mm
@@ -56,9 +62,16 @@ def find_unusual(urdf: Urdf, points: Mapping[str, Sequence[np.ndarray]]) -> list
         dense.append((f"{link.name} of {link.mass:.3g} kg", link.mass / volume))
     mass = sum(x.mass for x in urdf.links)
     places = [(j.name, math.hypot(*j.xyz)) for j in urdf.joints]
+    first = [j for j in urdf.movable if not urdf.movers(j.parent)]
+    apart = [
+        (f"{one.name} and {two.name}", math.dist(_at_rest(urdf, one), _at_rest(urdf, two)))
+        for one, two in itertools.combinations(first, 2)
+    ]
+    farthest = sorted(apart, key=lambda pair: pair[1])[-1:]
     named = [
         ("the size of links", "m", USUAL.size, sizes),
         ("the distance of joints from the joint before", "m", USUAL.place, places),
+        ("the distance of two fingers, or of two hands (--root),", "m", USUAL.apart, farthest),
         ("the mass of the whole hand", "kg", USUAL.hand_mass, [(urdf.name, mass)]),
         ("the density of links", "kg/m3", USUAL.density, dense),
     ]
@@ -76,6 +89,14 @@ def find_unusual(urdf: Urdf, points: Mapping[str, Sequence[np.ndarray]]) -> list
             named.append((f"the {what} of {kind}", *rest))
     found = [_outside(*kind) for kind in named]
     return [sentence for sentence in found if sentence]
+
+
+def _at_rest(urdf: Urdf, joint: Joint) -> list[float]:
+    """Return the place [m] of a joint that no other joint moves, in the frame of the root."""
+    pose = pose_of(joint)
+    for above in urdf.joints_above(joint.parent):
+        pose = pose_of(above) @ pose
+    return pose[:3, 3].tolist()
 
 
 def _outside(what: str, unit: str, bounds: Bounds, values: Iterable[tuple[str, float]]) -> str:
