@@ -10,9 +10,9 @@ import pytest
 import torch
 import yourdfpy
 
-from tests.make import see
+from tests.make import ball, see
 from tests.pinch import pinch
-from torchgrasp import load_object
+from torchgrasp import fit_shape, load_object
 from torchgrasp.data import load_shipped_grasp
 from torchgrasp.foundation.base import Value, check_whole, count_status, join, pick, put
 from torchgrasp.foundation.errors import BadArgument, FailedRows, Status, TooFewPoints
@@ -207,6 +207,10 @@ def test_a_value_of_too_many_fields_is_cut():
     assert len(text.splitlines()) == 12 and text.endswith("...)")
 
 
+def small_shape(kernel):
+    return fit_shape(ball(120), budget=30, seed=0, kernel=kernel)
+
+
 VALUES = {
     "Grasps": lambda: pinch("allegro")[1],
     "Hand": lambda: pinch("allegro")[0],
@@ -214,6 +218,9 @@ VALUES = {
     "ContactSpec": lambda: ContactSpec(table=Plane.horizontal(0.1)),
     "ContactPlan": lambda: plan([0, 14]),
     "Scene": lambda: see((0.0, 0.0, 0.06, 0.1)),
+    "ShapeGP": lambda: small_shape("thin_plate"),
+    "ShapeGP of Matern": lambda: small_shape("matern52"),
+    "ShapeGP of RBF": lambda: small_shape("rbf"),
 }
 
 

@@ -9,6 +9,7 @@ import torch
 import trimesh
 
 from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.pcd import decompress
 from torchgrasp.cloud.read import cloud_from_array, read_cloud, read_cloud_file, save_cloud
 from torchgrasp.files.columns import read_lines
@@ -568,3 +569,17 @@ def test_wrong_paths_and_viewpoints_are_refused_by_name(tmp_path, points):
             read_cloud(tmp_path / "a.npy", viewpoint=viewpoint)  # pyright: ignore[reportArgumentType]
     with pytest.raises(OutputError):
         save_cloud(PointCloud(torch.from_numpy(points)), tmp_path / "a.npy" / "b.npz")
+
+
+def test_masked_numbers_are_refused_as_they_would_count():
+    """NumPy forgets a mask where an array is converted."""
+    points = np.random.default_rng(0).random((50, 3))
+    some = np.ma.masked_greater(points, 0.9)
+    with pytest.raises(BadArgument, match=r"masked array, with .* of 150 numbers masked"):
+        cloud_from_array(some)
+    # as the error says
+    assert len(cloud_from_array(some.filled(np.nan))) < 50
+    assert len(cloud_from_array(np.ma.array(points))) == 50
+    depth = np.full((8, 8), 0.5)
+    with pytest.raises(BadArgument, match=r"depth: .*masked"):
+        cloud_from_depth(np.ma.array(depth, mask=depth > 0), (60.0, 60.0, 4.0, 4.0))

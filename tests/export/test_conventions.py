@@ -407,3 +407,47 @@ def test_quaternions_of_the_other_order_are_told(tmp_path):
         # hands in the world, whose origin is anywhere
         far = row((np.array([0.0, 0.0, 5.0]), Rotation.from_rotvec([0.0, 0.3, 0.0])), [], other)
         read(rows, other, obj_pose=far)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("format", "their grasps", "torchgrasp grasps"),
+        ("version", 4, "a number in"),
+        ("units", {"angle": "deg"}, "expected rad"),
+        ("units", {"length": "mm"}, "expected m,"),
+    ],
+)
+def test_our_json_of_another_format_or_unit_is_refused(tmp_path, key, value, said):
+    hand, grasp = pinch("barrett")
+    content = json.loads(format_grasps(hand, grasp))
+    content[key] = content[key] | value if isinstance(value, dict) else value
+    file = tmp_path / "grasps.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(ModelFileError, match=said):
+        read_foreign(file, hand)
+
+
+def test_what_a_simulation_adds_to_its_grasps_and_another_gripper_are_told(tmp_path):
+    """MultiGripperGrasp's `dofs` begin a trial; `result` and `final_dofs` are what came of it."""
+    hand, grasp = pinch("barrett")
+    turn = Rotation.from_matrix(grasp.obj_from_hand[0, :3, :3].numpy()).as_quat(scalar_first=True)
+    every = hand.expand_joints(grasp.joints).tolist()
+    content = {
+        "gripper": "Barrett",
+        "object_ID": "cup",
+        "pose": [[*grasp.obj_from_hand[0, :3, 3].tolist(), *turn.tolist()]],
+        "dofs": every,
+        "test_duration": 3,
+    }
+    file = tmp_path / "grasps.json"
+    file.write_text(json.dumps(content))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_foreign(file, hand, hand.tree.joint_names)
+    file.write_text(json.dumps(content | {"result": [0], "final_dofs": every}))
+    with pytest.warns(GraspFileWarning, match="not read: final_dofs, result"):
+        read_foreign(file, hand, hand.tree.joint_names)
+    file.write_text(json.dumps(content | {"gripper": "HumanHand"}))
+    with pytest.warns(GraspFileWarning, match="gripper HumanHand, read for the barrett hand"):
+        read_foreign(file, hand, hand.tree.joint_names)

@@ -236,3 +236,15 @@ def test_the_command_takes_names_a_file_of_names_and_a_flange(tmp_path, capsys):
             more = ["--object", "x"] if case[0] == "graspgen" else []
             assert cli.main([*words, *case, *more]) == 2
             assert f"torchgrasp: {option}" in capsys.readouterr().err
+
+
+def test_a_time_just_below_a_second_has_valid_nanoseconds():
+    """The message allows less than 1e9 of them."""
+    times = torch.tensor([0.0, 0.25, 1.9999999999], dtype=torch.float64)
+    motion = ArmMotion(("a",), times, torch.zeros(1, 3, 1).double(), {"above": 0})
+    points = yaml.safe_load(format_motion(pinch("barrett")[0], motion))["points"]
+    assert [point["time_from_start"] for point in points] == [
+        {"sec": 0, "nanosec": 0},
+        {"sec": 0, "nanosec": 250_000_000},
+        {"sec": 2, "nanosec": 0},
+    ]

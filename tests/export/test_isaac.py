@@ -19,7 +19,7 @@ from torchgrasp import Plane, load_grasps, load_hand
 from torchgrasp.app import cli
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_isaac, read_foreign
-from torchgrasp.foundation.errors import GraspFileWarning, ModelFileError
+from torchgrasp.foundation.errors import BadArgument, GraspFileWarning, ModelFileError
 from torchgrasp.geometry.frames import apply
 
 READER = Path(__file__).parents[2] / ".beside" / "graspgenx" / "bin" / "python"
@@ -143,6 +143,18 @@ def test_what_is_written_comes_back(tmp_path, name, options):
         read.obj_from_hand, grasp.obj_from_hand.double(), rtol=0.0, atol=2e-15
     )
     assert read.table is None
+
+
+def test_a_flange_has_the_name_of_a_link_only_where_this_link_is(tmp_path):
+    """A reader takes poses under the name of a link for poses of this link."""
+    hand, grasp = pinch("barrett")
+    flange = torch.from_numpy(matrix([0.01, 0.0, -0.05], 0.6, [0.0, 0.8, 0.0]))
+    for name in ("palm", "/World/barrett/palm"):
+        with pytest.raises(BadArgument, match=r"gripper_link.*not where the flange is"):
+            format_isaac(hand, grasp, flange=flange, gripper_link=name)
+    still = torch.eye(4, dtype=torch.float64)
+    text = format_isaac(hand, grasp, flange=still, gripper_link="palm")
+    assert yaml.safe_load(text) == yaml.safe_load(format_isaac(hand, grasp))
 
 
 def test_joints_that_follow_are_left_out_on_demand_and_names_are_the_robots(tmp_path):

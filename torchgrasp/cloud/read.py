@@ -23,6 +23,7 @@ from torchgrasp.foundation.base import Value, named_tensors
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument, CloudFileError, TooFewPoints
 from torchgrasp.foundation.limits import CLOUD_BYTES, CLOUD_POINTS
+from torchgrasp.foundation.rules import check_unmasked
 from torchgrasp.geometry.linalg import unit as unit_vectors
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
@@ -348,6 +349,7 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
     """Return an array of points as float64 rows (n, 3), or refuse the file `source`; a viewpoint
     may be (3,).
     """
+    check_unmasked(name, array)
     array = np.asarray(array)
     if array.dtype.kind not in "fiu":
         raise CloudFileError("path", f"{source}: {name} of type {array.dtype}", "real numbers")
@@ -368,6 +370,7 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
     """Return arrays in which the table of 3 or 6 columns is split into points and normals. Colours
     are left out.
     """
+    check_unmasked("points", arrays["columns"])
     table = np.asarray(arrays["columns"])
     if names := table.dtype.names:
         pixels = table.reshape(-1)  # an organised cloud (h, w) as well

@@ -28,6 +28,7 @@ from torchgrasp.export.file_joints import (
 )
 from torchgrasp.export.isaac import parse_isaac
 from torchgrasp.export.other_formats import bench_frame
+from torchgrasp.export.postures import CONVENTIONS, OWN_FORMAT, OWN_VERSION
 from torchgrasp.files import Field, is_file, read_bytes, read_json
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.checks import checked
@@ -66,6 +67,10 @@ class OrderNumbers:
 ORDER = OrderNumbers()
 POSE_NUMBERS = 7  # of a pose: a position and a quaternion
 ROOTS = ("root_link", "base_link")  # names of the link whose poses a file has
+# fields of a MultiGripperGrasp file: read, and those that we know and need not
+GRIPPER_READ = ("gripper", "pose", "dofs", "obj_pose", *ROOTS)
+GRIPPER_KNOWN = ("object_ID", "test_type", "controller", "test_duration", "physics_dt")
+GRIPPER_TIMES = ("result_time", "runtime", "timestamp")  # known, too
 # arrays of a DexGraspBench file: read, and those that we know and need not
 BENCH_READ = ("grasp_qpos", "pregrasp_qpos", "obj_pose")
 BENCH_KNOWN = ("obj_path", "obj_scale", "squeeze_qpos")
@@ -116,6 +121,8 @@ def read_foreign(
     If the file has an `obj_pose`, its poses are in the world, and are moved to the object's frame.
     DexGraspBench's hand may move from pre-grasp to grasp. Here it stays at the grasp. The joints of
     the pre-grasp are changed, so that its fingertips are where the file has them.
+    MultiGripperGrasp's `dofs` are the joints with which its simulation starts. Its `final_dofs` and
+    `result` are not read.
 
     Coupled and parked joints of the file may differ from the hand's, unless a fingertip moves by
     over 0.1 mm. A `GraspFileWarning` names values that are not kept, and joints that bend backward.
@@ -165,6 +172,7 @@ def read_foreign(
     if "grasps" in fields:
         return _read_own(fields, hand, unit_m, root)
     content = file.entries("pose", "dofs")
+    _tell_unread(path, content, hand)
     columns = read_order(hand, order)
     pose = _table(content["pose"], POSE_NUMBERS)
     dofs = _table(content["dofs"], len(columns))
@@ -181,6 +189,19 @@ def read_foreign(
     named = [content[name].text() for name in ROOTS if name in content]
     poses = poses @ _link_from_root(hand, joints, root if root != "" else "".join(named[:1]))
     return ForeignGrasps(joints, poses, None)
+
+
+def _tell_unread(path: Path, content: dict[str, Field], hand: Hand) -> None:
+    """Warn of fields of a MultiGripperGrasp file that are not read, and of another hand's name."""
+    if others := sorted({*content} - {*GRIPPER_READ, *GRIPPER_KNOWN, *GRIPPER_TIMES}):
+        warn_user(GraspFileWarning, f"{path.name}: not read: {', '.join(others)}")
+    gripper = content["gripper"].value if "gripper" in content else None
+    if not isinstance(gripper, str):
+        return
+    names = sorted((gripper.casefold(), hand.name.casefold()), key=len)
+    if names[0] not in names[1]:
+        told = f"{path.name}: grasps of the gripper {gripper}, read for the {hand.name} hand"
+        warn_user(GraspFileWarning, told)
 
 
 def _link_from_root(
@@ -218,6 +239,7 @@ def _read_own(
     fields: dict[str, Field], hand: Hand, unit_m: float, root: str | Pose
 ) -> ForeignGrasps:
     """Return the grasps of a file of `format_grasps`, given its fields."""
+    _check_own(fields)
     about = fields["hand"].entries() if "hand" in fields else {}
     if "name" in about and about["name"].text() != hand.name:
         raise about["name"].wrong(f"grasps of the {hand.name} hand, which is to read them")
@@ -251,6 +273,20 @@ def _read_own(
     table = _read_table(fields, np.array(rises), unit_m)
     placed = read_poses(places, "wxyz", unit_m) @ _link_from_root(hand, joints["grasp"], root)
     return ForeignGrasps(joints["grasp"], placed, joints["pregrasp"], table)
+
+
+def _check_own(fields: dict[str, Field]) -> None:
+    """Raise `ModelFileError` if a file says that it has another format, version or units than the
+    files of `format_grasps`.
+    """
+    if "format" in fields and fields["format"].value != OWN_FORMAT:
+        raise fields["format"].wrong(OWN_FORMAT)
+    if "version" in fields:
+        fields["version"].number(1.0, float(OWN_VERSION))
+    units = fields["units"].entries() if "units" in fields else {}
+    for name, unit in CONVENTIONS["units"].items():
+        if name in units and units[name].value != unit:
+            raise units[name].wrong(unit)
 
 
 def _read_table(fields: dict[str, Field], rises: np.ndarray, unit_m: float) -> Plane | None:

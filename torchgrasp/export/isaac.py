@@ -27,7 +27,7 @@ from torchgrasp.export.ros_messages import OBJECT_FRAME
 from torchgrasp.files import Field
 from torchgrasp.files.write import Malformed, Refuse, explain, read_bounded
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import GraspFileWarning
+from torchgrasp.foundation.errors import BadArgument, GraspFileWarning
 from torchgrasp.foundation.limits import JSON_BYTES
 from torchgrasp.foundation.rules import Force, Pose, Positive
 from torchgrasp.foundation.told import warn_user
@@ -45,6 +45,7 @@ SQUEEZE = "squeeze_cspace_position"  # a key of ours, which other readers skip
 FLANGE = "flange"
 POSE_KEYS = "confidence", "position", "orientation"
 ALLOWED = f"an {FORMAT} file of version {VERSION}"
+ROUNDING = 1e-6  # largest difference [m] of a flange from a link of its name
 DEEPEST = 8  # most levels of a file; the format has five
 OWN = "# grasps of the {} hand, by torchgrasp"  # the first line of our files
 OWN_HAND = re.compile(OWN.format("(.+)"))
@@ -96,6 +97,7 @@ def format_isaac(
         BadArgument: joints are of another hand.
         BadArgument: the `force` is outside 0.01 to 100 N, or `kp` is not positive.
         BadArgument: names are unknown, empty or equal.
+        BadArgument: the flange has the name of a link of the hand that is elsewhere.
         BadArgument: a hand must go down while it closes, because its opened fingers would be in the
             table. A file with one pose for each grasp cannot express this.
 
@@ -115,6 +117,7 @@ def format_isaac(
     poses = grasps.obj_from_hand.double()
     if flange is not None:
         frame = gripper_link or FLANGE
+        _check_flange(hand, grasps, frame, flange.double().cpu())
         poses = poses @ flange.double().cpu()
     else:
         frame = gripper_link or root
@@ -146,6 +149,16 @@ def format_isaac(
     return heading + yaml.safe_dump(
         content, default_flow_style=None, width=math.inf, sort_keys=False, allow_unicode=True
     )
+
+
+def _check_flange(hand: Hand, grasps: Grasps, frame: str, flange: Float[Tensor, "4 4"]) -> None:
+    """Raise `BadArgument` if the flange has the name of a link of the hand that is elsewhere."""
+    link = frame.rpartition("/")[2]
+    if link not in hand.tree.link_names:
+        return
+    if not torch.allclose(_root_from_link(hand, grasps, link), flange, rtol=0.0, atol=ROUNDING):
+        found = f"{frame!r}, a link of the hand that is not where the flange is"
+        raise BadArgument("gripper_link", found, "another name for the flange, or no flange")
 
 
 def _root_from_link(hand: Hand, grasps: Grasps, link: str) -> Float[Tensor, "*g 4 4"]:

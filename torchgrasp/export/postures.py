@@ -31,6 +31,8 @@ CONVENTIONS: dict[str, Any] = json.loads(
     (Path(__file__).parent / "templates" / "conventions.json").read_text("utf-8")
 )
 """Meaning of the numbers in a JSON file of grasps; the file contains this text."""
+OWN_FORMAT = "torchgrasp grasps"
+OWN_VERSION = 3  # version 1 had no approach, version 2 no rise
 TASK = "task_margin", "task_load", "task_twist", "task_forces", "task_strength"
 """Fields of the `Certificate`, which explains them. The file has them if grasps were planned with
 `resist`.
@@ -122,8 +124,8 @@ def format_grasps(
         return entry
 
     content = {
-        "format": "torchgrasp grasps",
-        "version": 3,  # version 1 had no approach, version 2 no rise
+        "format": OWN_FORMAT,
+        "version": OWN_VERSION,
         **CONVENTIONS,
         "hand": {
             "name": hand.name,

@@ -241,7 +241,9 @@ def _trajectories(
 
 def _duration(seconds: float) -> dict[str, int]:
     """Return a time in `seconds` as a builtin_interfaces/Duration, a dictionary."""
-    return {"sec": int(seconds), "nanosec": round(NANOSECONDS * (seconds % 1))}
+    # rounded first: the nanoseconds are fewer than those of a second
+    whole = round(NANOSECONDS * seconds)
+    return {"sec": whole // int(NANOSECONDS), "nanosec": whole % int(NANOSECONDS)}
 
 
 def _pose(obj_from_hand: Float[Tensor, "4 4"]) -> dict[str, Any]:

@@ -41,6 +41,7 @@ from torchgrasp.foundation.rules import (
     check_dense,
     check_path,
     check_plain,
+    check_unmasked,
     describe,
     fits,
     is_known,
@@ -231,6 +232,8 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
     `BadArgument`.
     """
     _, origin, inside, is_number, of_tensor, is_container = _form(hint)
+    if isinstance(value, np.ndarray):
+        check_unmasked(name, value)
     if of_tensor:
         return _read_tensor(name, value, hint, call)
     if origin is Annotated:

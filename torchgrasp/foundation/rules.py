@@ -204,6 +204,19 @@ def check_plain(name: str, value: Tensor) -> None:
         )
 
 
+def check_unmasked(name: str, value: Any) -> None:
+    """Raise `BadArgument` if a value is a masked array of NumPy with masked numbers, which would
+    count like the others; errors call it by `name`.
+    """
+    if not isinstance(value, np.ma.MaskedArray):
+        return
+    masked = int(np.ma.getmaskarray(value).sum())
+    if masked:
+        found = f"a masked array, with {masked} of {value.size} numbers masked"
+        allowed = "a plain array: what was not measured is NaN, as by .astype(float).filled(nan)"
+        raise BadArgument(name, found, allowed)
+
+
 def _levels(value: Tensor) -> list[Tensor]:
     """Return a tensor and the tensors that it wraps, one for each transform of torch.func around
     the call.

@@ -9,7 +9,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -46,6 +46,22 @@ class ProfileNumbers:
 
 
 PROFILE = ProfileNumbers()
+
+
+class Formula(partial[Any]):
+    """A function of a module with its numbers given, which equals others of the same.
+
+    A kernel of formulas is equal to its copies, and can be pickled.
+    """
+
+    def _compared(self) -> tuple[Any, ...]:
+        return self.func, self.args, tuple(sorted(self.keywords.items()))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Formula) and self._compared() == other._compared()
+
+    def __hash__(self) -> int:
+        return hash(self._compared())
 
 
 @checked
@@ -204,8 +220,8 @@ def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
         "use a psi_scale of at least 1.34: "
         "the thin plate kernel is a covariance only within 3/4 psi"
     )
-    fast = closed_form and partial(differentiate_thin_plate, psi)
-    return Kernel(partial(thin_plate, psi=psi), psi / (4.0 / 3.0), remedy, fast)
+    fast = closed_form and Formula(differentiate_thin_plate, psi)
+    return Kernel(Formula(thin_plate, psi=psi), psi / (4.0 / 3.0), remedy, fast)
 
 
 def is_thin(kernel: Kernel) -> bool:
@@ -247,22 +263,26 @@ def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     1.0
     """
     scale = math.sqrt(5) / length
+    profile = Formula(_matern52, scale, variance)
+    return Kernel(profile, closed_form=Formula(_differentiate_matern52, scale, variance))
 
-    def profile(r: Tensor) -> Tensor:
-        s = scale * r
-        return variance * (1.0 + s + s * s / 3.0) * torch.exp(-s)
 
-    def closed_form(r: Tensor, count: int) -> tuple[Tensor, ...]:
-        fall = torch.exp(-scale * r) * (variance / 3.0)
-        inverse = torch.reciprocal(r).masked_fill(r == 0, 0.0)
-        orders = (
-            -(scale**2) * (1.0 + scale * r) * fall,
-            scale**4 * fall,
-            -(scale**5) * inverse * fall,
-        )
-        return profile(r), *orders[: count - 1]
+def _matern52(scale: float, variance: float, r: Tensor) -> Tensor:
+    s = scale * r
+    return variance * (1.0 + s + s * s / 3.0) * torch.exp(-s)
 
-    return Kernel(profile, closed_form=closed_form)
+
+def _differentiate_matern52(
+    scale: float, variance: float, r: Tensor, count: int
+) -> tuple[Tensor, ...]:
+    fall = torch.exp(-scale * r) * (variance / 3.0)
+    inverse = torch.reciprocal(r).masked_fill(r == 0, 0.0)
+    orders = (
+        -(scale**2) * (1.0 + scale * r) * fall,
+        scale**4 * fall,
+        -(scale**5) * inverse * fall,
+    )
+    return _matern52(scale, variance, r), *orders[: count - 1]
 
 
 @checked
@@ -277,15 +297,17 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     >>> float(rbf_kernel(1.0).profile(torch.zeros(())))
     1.0
     """
+    profile = Formula(_rbf, length, variance)
+    return Kernel(profile, closed_form=Formula(_differentiate_rbf, length, variance))
 
-    def profile(r: Tensor) -> Tensor:
-        return variance * torch.exp(r * r * (-0.5 / length**2))
 
-    def closed_form(r: Tensor, count: int) -> tuple[Tensor, ...]:
-        k = profile(r)
-        return tuple(k * (-1.0 / length**2) ** order for order in range(count))
+def _rbf(length: float, variance: float, r: Tensor) -> Tensor:
+    return variance * torch.exp(r * r * (-0.5 / length**2))
 
-    return Kernel(profile, closed_form=closed_form)
+
+def _differentiate_rbf(length: float, variance: float, r: Tensor, count: int) -> tuple[Tensor, ...]:
+    k = _rbf(length, variance, r)
+    return tuple(k * (-1.0 / length**2) ** order for order in range(count))
 
 
 def kernel_of(kernel: KernelName | Kernel, psi: float) -> Kernel:
