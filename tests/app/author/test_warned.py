@@ -212,6 +212,20 @@ def test_numbers_that_no_hand_has_are_named(claw, old, new, words):
     assert any(re.search(words, x) for x in told)
 
 
+def test_a_frame_of_a_nanogram_is_merged_as_one_without_mass(claw, tmp_path):
+    """Exporters give frames a mass of 1e-9 kg, with which no simulator can reckon."""
+    inertial = f'<inertial><mass value="1e-9"/>{INERTIA.format(0)}</inertial>'
+    frame = (
+        f'<link name="left_frame">{inertial}</link><joint name="left_frame_fixed" type="fixed">'
+        '<parent link="left_tip"/><child link="left_frame"/><origin xyz="0 0 0.011"/></joint>'
+    )
+    draft = new_hand(with_links(claw, frame))
+    assert any("frames without mass" in x and "left_frame" in x for x in draft.repairs)
+    (tmp_path / "hand.urdf").write_text(draft.urdf)
+    (tmp_path / "hand.toml").write_text(draft.toml)
+    assert "left_frame" not in load_hand(tmp_path).tree.link_names
+
+
 def test_two_ends_of_one_finger_are_no_two_fingers(claw):
     """A finger with two ends is one finger, unless the user names both."""
     ends = with_links(claw, fixed("left_far", "left_nail", "0.01 0.01 0.01", "0.01 0.015 0.04"))

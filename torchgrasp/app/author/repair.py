@@ -25,6 +25,8 @@ class RepairNumbers:
     force: float = 10.0  # greatest force [N]
     speed: float = 0.1  # greatest speed [m/s], of grippers
     most_wrist: int = 3  # joints that move all fingertips: more are an arm
+    # a link without shapes is a frame up to this mass [kg]: exporters write 1e-9 where one is needed
+    frame: float = 1e-5
     marker: float = 6e-3  # a fixed end link is a marker if smaller [m]: no fingertip is so small
     # least mass and edge of a body without mass, so that simulators remain stable
     least_mass: float = 1e-3  # least mass [kg]
@@ -98,8 +100,8 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
         for j in (j for j in urdf.joints if j.kind == "fixed"):
             child = links[j.child]
             parent = links[j.parent]
-            bare_root = j.parent == urdf.root and not (parent.mass > 0 or parent.shapes)
-            frame = not child.mass > 0 and (j.child in parents or not child.shapes)
+            bare_root = j.parent == urdf.root and _is_bare(parent)
+            frame = _is_bare(child) or (not child.mass > 0 and j.child in parents)
             if frame or bare_root:
                 break
         else:
@@ -111,6 +113,11 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
         shapes = parent.shapes + moved.shapes
         merged = dataclasses.replace(heavy, name=parent.name, shapes=shapes)
         urdf, taken = _merge(urdf, j, merged, taken)
+
+
+def _is_bare(link: Link) -> bool:
+    """Return whether a link is a frame alone, without shapes and with hardly any mass."""
+    return not link.shapes and not link.mass > REPAIRS.frame
 
 
 def merge_markers(
