@@ -158,6 +158,20 @@ def test_every_number_of_the_yaml_is_a_number_and_graspgen_finds_transforms_and_
     assert content["grasps"]["object_in_gripper"] == [False]
 
 
+def test_joints_of_other_names_are_refused():
+    """Another hand of this name may have as many joints, in another order."""
+    hand, grasp = pinch("barrett")
+    for given in (hand.joint_names[::-1], ("a", *hand.joint_names[1:])):
+        other = dataclasses.replace(grasp, meta=grasp.meta | {"joint_names": ",".join(given)})
+        with pytest.raises(BadArgument, match=f"the joints {given[0]}"):
+            format_moveit(hand, other)
+    few = dataclasses.replace(grasp, meta={"joint_names": "a,b"})
+    with pytest.raises(BadArgument, match="a name for each joint"):
+        format_graspgen(few, "jug.obj")
+    nameless = dataclasses.replace(grasp, meta={})
+    assert json.loads(format_graspgen(nameless, "jug.obj"))["joint_names"] == []
+
+
 def test_a_trajectory_each_goes_from_pregrasp_to_squeeze():
     hand, grasp = pinch("barrett")
     two = grasp[torch.tensor([0, 0])]

@@ -332,7 +332,7 @@ def test_links_and_joints_of_a_hand_may_have_any_name(tmp_path):
     assert {"mount_x", "wrist"} <= {*hand.joint_names}
     grasp = load_shipped_grasp("jug", "barrett")
     grasp = dataclasses.replace(
-        grasp, meta=grasp.meta | {"joint_names": json.dumps(hand.joint_names)}
+        grasp, meta=grasp.meta | {"joint_names": ",".join(hand.joint_names)}
     )
     thing = load_object("jug")
     for player in ("mujoco", "usd"):

@@ -144,7 +144,7 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
 def check_same_hand(hand: Hand, grasps: Grasps) -> None:
     """Raise `BadArgument` if grasps are not the hand's: by its name, their fingers or joints.
 
-    Grasps whose metadata name no hand or no fingers need only the number of fingers.
+    Grasps whose metadata name no hand, fingers or joints need only the number of each.
     """
     planned = grasps.meta.get("hand", hand.name)
     if planned != hand.name:
@@ -159,6 +159,10 @@ def check_same_hand(hand: Hand, grasps: Grasps) -> None:
     joints = grasps.joints.shape[-1]
     if joints != hand.dof:
         raise BadArgument("grasps", f"{joints} joints", f"the {hand.dof} joints of {hand.name}")
+    named = grasps.meta.get("joint_names", ",".join(hand.joint_names))
+    if named != ",".join(hand.joint_names):
+        ours = ", ".join(hand.joint_names)
+        raise BadArgument("grasps", f"the joints {named}", f"those of the hand: {ours}")
 
 
 def press(

@@ -104,12 +104,15 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
 
     `transforms` [m] are poses of the hand's root link in the object's frame. `object_in_gripper`
     says which grasps are executable. The fields `success` (predicted probability, null if unknown),
-    `joints` [rad or m] and `joint_names` are additions of torchgrasp.
+    `joints` [rad or m] and `joint_names` are additions of torchgrasp; `joint_names` is empty if
+    `meta` of the grasps has none.
 
     Args:
         grasps: grasps, executable or not.
         object_path: path of the mesh in the data set. Its frame is the frame of the planned cloud,
             its scale 1.
+
+    Raises `BadArgument` if `meta` of the grasps names more or fewer joints.
 
     >>> import json
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -123,7 +126,11 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
         "success": grasps.success.tolist(),
         "joints": grasps.joints.tolist(),
     }
-    joint_names = grasps.meta.get("joint_names", "").split(",")
+    named = grasps.meta.get("joint_names", "")
+    joint_names = named.split(",") if named else []
+    if named and len(joint_names) != grasps.joints.shape[-1]:
+        found = f"{grasps.joints.shape[-1]} joints, of the names {named}"
+        raise BadArgument("grasps", found, "a name for each joint, as plan_grasps writes")
     return format_json(
         {"object": {"file": object_path, "scale": 1.0}, "joint_names": joint_names, "grasps": rows}
     )
