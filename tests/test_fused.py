@@ -120,6 +120,26 @@ def test_jets_of_a_thin_plate(shape, both):
             assert_close(one, other)
 
 
+def test_distances_in_a_grid(both, worlds):
+    """Inside, on nodes, and outside of the grid, beside one or several of its sides."""
+    field = worlds[0].field
+    nodes = field.origin + field.spacing * torch.tensor([[0, 0, 0], [3, 4, 5]])
+    points = torch.cat([0.3 * random(40, 3), 0.05 * random(40, 3), nodes, nodes[:1] - 0.01])
+    wanted, found = both(lambda: field.query(points[None]))
+    for one, other in zip(found, wanted, strict=True):
+        assert_close(one, other)
+
+
+def test_choice_of_observed_points(both):
+    """The choice itself, and the posterior given the points."""
+    normals = unit(random(120, 3))
+    cloud = PointCloud(0.04 * normals, normals)
+    wanted, found = both(lambda: fit_shape(cloud, budget=40))
+    assert_close(found.x, wanted.x)
+    assert_close(found.factor, wanted.factor)
+    assert_close(found.weights, wanted.weights, 1e-7)  # the inverse of a covariance grows roundings
+
+
 @pytest.mark.parametrize("size", [(2, 2), (9, 7)])
 def test_distances_from_an_open_mesh(both, size):
     """Few samples are one leaf of the tree, many are not filled evenly; points touch the mesh."""

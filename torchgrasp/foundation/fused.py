@@ -91,4 +91,5 @@ def _content(function: Any) -> bytes:
 
 def array(x: Tensor, dtype: torch.dtype = torch.float64) -> np.ndarray:
     """Return a tensor as a contiguous array, which shares its memory if it can."""
-    return np.ascontiguousarray(x.detach().to(dtype).numpy())
+    x = x.detach() if x.requires_grad else x
+    return np.ascontiguousarray(x.to(dtype).numpy())

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.fused import array, is_fused
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh_distance import MeshSurface
@@ -168,6 +169,19 @@ class SignedDistanceField(DistanceField):
         Other distance fields hold one object for each entry of a batch, and return some of them.
         """
         return self
+
+    @checked(gradients=True)
+    def query(
+        self, points: Float[Tensor, "*b 3"]
+    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+        """Return (distance, gradient) at points (*b, 3) [m], as `DistanceField.query`."""
+        if not is_fused(points, self.values, self.origin):
+            return super().query(points)
+        from torchgrasp.geometry import fused_grid  # it imports numba
+
+        nodes, origin = map(array, (self.nodes, self.origin))
+        shape = np.array(self.values.shape)
+        return fused_grid.query(fused_grid.LookedUp(nodes, origin, shape, self.spacing), points)
 
     @kept
     def _cells(self) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:

@@ -8,9 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.fused import array, compiled
+from torchgrasp.geometry.fused_grid import look_up
 from torchgrasp.geometry.fused_vectors import add, scale
 from torchgrasp.ik.clearance import CollisionWorld
-from torchgrasp.ik.fused_world import coarse_clearance, exact_clearance, world_parts
+from torchgrasp.ik.fused_world import coarse_clearance, world_parts
 
 
 @compiled
@@ -34,13 +35,13 @@ def _sweep(parts, centres, direction, step, nodes, coarse, least):
                         first = p
                         own = s
             if nodes > 0.0 and part.kind == 2:
-                near = exact_clearance(part, first)[0] + part.grown[own]
+                near = look_up(part, first)[0] + part.grown[own]
                 within = near + nodes * part.spacing
                 for k in range(steps):
                     for s in range(spheres):
                         if coarse[k, s] < within:
                             p = add(centres[g, s], direction[g], -step * (k + 1))
-                            near = min(near, exact_clearance(part, p)[0] + part.grown[s])
+                            near = min(near, look_up(part, p)[0] + part.grown[s])
             least[g] = min(least[g], near)
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.fused import array, compiled, inlined
+from torchgrasp.geometry.fused_grid import look_up
 from torchgrasp.geometry.fused_vectors import (
     add,
     copy,
@@ -29,7 +30,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.self_collision import LEAST_SQUARE, PARALLEL_EDGES
 from torchgrasp.ik.clearance import CLEARANCE, HINGES, MILLIMETRE, SELF_CLEARANCE, CollisionWorld
 from torchgrasp.ik.configuration import Configuration
-from torchgrasp.ik.fused_world import coarse_clearance, exact_clearance, place, turn, world_parts
+from torchgrasp.ik.fused_world import coarse_clearance, place, turn, world_parts
 
 INDEX = torch.int64
 
@@ -232,7 +233,7 @@ def _clear(h, n, part, spheres, twists, order, index, residual, jacobian):
         clearance = order[k]
         slope = (part.origin[0], part.origin[1], part.origin[2])
         if part.kind == 2:
-            distance, slope = exact_clearance(part, p)
+            distance, slope = look_up(part, p)
             clearance = distance + part.grown[index[k]]
         if clearance < n.clearance:
             residual[k] = (n.clearance - clearance) * n.unit

@@ -14,9 +14,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, map_tensors
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.geometry.linalg import Points, cholesky
 from torchgrasp.shape.estimate import Observations
-from torchgrasp.shape.kernel import Kernel, covariance_rows, cross_covariance, gram
+from torchgrasp.shape.kernel import Kernel, covariance_rows, cross_covariance, gram, is_thin
 from torchgrasp.shape.posterior import Posterior
 
 Criterion = Literal["variance", "error", "both"]
@@ -139,6 +140,11 @@ def select_points(
     noise = torch.stack([candidates.distance_noise] + 3 * [candidates.normal_noise], 1) ** 2
     values = torch.cat([candidates.distance[:, None], candidates.normal], 1)
 
+    covariances = _pick_covariances
+    if is_fused(x) and is_thin(kernel):
+        from torchgrasp.shape import fused_jets  # it imports numba
+
+        covariances = fused_jets.pick_covariances
     picks = torch.empty(budget, dtype=torch.long, device=x.device)
     free = torch.zeros_like(error)  # minus infinity for the picks
     count = 0
@@ -148,16 +154,14 @@ def select_points(
         p = torch.argmax(free + _score(criterion, variance, error), keepdim=True)
         end = old + 4 * count
         new = slice(end, end + 4)
-        # (d, w) of the pick with (d, w) of every candidate; rows of the factor go pick by pick
-        with_all = cross_covariance(kernel, x[p], x, n).view(4, 4, n)
-        with_picks = with_all[:, :, picks[:count]]
-        with_picks = with_picks.permute(2, 1, 0).reshape(4 * count, 4)
+        # rows of the factor go pick by pick
+        with_candidates, with_picks = covariances(kernel, x, p, picks[:count])
         cross = torch.cat([with_known[:, p].squeeze(1).T, with_picks])
         before = torch.linalg.solve_triangular(factor[:end, :end], cross, upper=False)
         own = prior + torch.diag(noise[p][0])
         own = own - before.T @ before
         corner = cholesky(own, "the covariance of a picked point", kernel.remedy)
-        left = torch.cat([with_all[:, 0], values[p].T], 1)
+        left = torch.cat([with_candidates, values[p].T], 1)
         left.addmm_(before.T, whitened[:end], alpha=-1.0)
         factor[new, :end] = before.T
         factor[new, new] = corner
@@ -174,6 +178,22 @@ def select_points(
     by_pick = by_pick.reshape(4, count).T.flatten()
     new = candidates[picks]
     return Selection(picks, _extend(start, new, factor, whitened[:rows, n], by_pick))
+
+
+def _pick_covariances(
+    kernel: Kernel,
+    x: Points,
+    p: Int[Tensor, "1"],
+    picks: Int[Tensor, "picks"],
+) -> tuple[Float[Tensor, "4 n"], Float[Tensor, "rows 4"]]:
+    """Return the prior covariances of (d, w) at the point with the index `p`.
+
+    First with the distances at all n points `x`, then with (d, w) at the points `picks`: four rows
+    for each.
+    """
+    with_all = cross_covariance(kernel, x[p], x, len(x)).view(4, 4, len(x))
+    with_picks = with_all[:, :, picks].permute(2, 1, 0)
+    return with_all[:, 0], with_picks.reshape(4 * len(picks), 4)
 
 
 def _score(
