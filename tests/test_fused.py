@@ -27,13 +27,15 @@ from torchgrasp.foundation import fused
 from torchgrasp.foundation.base import Value, named_tensors
 from torchgrasp.foundation.errors import MissingExtra
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import farthest_points, unit
 from torchgrasp.geometry.mesh_distance import MeshSurface
 from torchgrasp.ik.clearance import CollisionWorld, Obstacles
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.ik.motion import _clearance
 from torchgrasp.ik.refine import grasp_residuals, open_hand, refine
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
+from torchgrasp.shape.completion.silhouette import Outlines
+from torchgrasp.shape.completion.symmetry import SymmetryScorer
 from torchgrasp.shape.fit import fit_shape
 
 
@@ -128,6 +130,20 @@ def test_distances_in_a_grid(both, worlds):
     wanted, found = both(lambda: field.query(points[None]))
     for one, other in zip(found, wanted, strict=True):
         assert_close(one, other)
+
+
+def test_farthest_and_nearest_points(both):
+    """Fewer points than a leaf holds, and many; none of some queries is near enough."""
+    for count in (5, 300):
+        points = random(count, 3)
+        wanted, found = both(lambda points=points: farthest_points(points, 40, first=2, tie=1e-9))
+        assert torch.equal(found, wanted)
+        scorer = SymmetryScorer(points, unit(points), Outlines(()), None, False, found)
+        at = 1.5 * random(50, 3, seed=1)[:, None]
+        wanted, found = both(lambda scorer=scorer, at=at: scorer.nearest(at, 0.3))
+        assert_close(found[0], wanted[0])
+        assert torch.equal(found[1], wanted[1])
+        assert bool(wanted[0].isinf().any())
 
 
 def test_choice_of_observed_points(both):

@@ -8,18 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from torchgrasp.foundation.fused import compiled, inlined
-from torchgrasp.geometry.fused_vectors import add, dot
+from torchgrasp.geometry.fused_points import find_nearest
+from torchgrasp.geometry.fused_vectors import add, dot, minus
 from torchgrasp.geometry.mesh import LEAST_SPAN
 
 if TYPE_CHECKING:
-    from torchgrasp.geometry.mesh_distance import Boxes, MeshSurface
+    from torchgrasp.geometry.mesh_distance import MeshSurface, Samples
 
 LEEWAY = 1.0 + 1e-9  # factor of a squared distance, above the rounding of its sum
 
 
 def distance(
     points: np.ndarray,
-    boxes: "Boxes",
+    samples: "Samples",
     surface: "MeshSurface",
     tried: int,
 ) -> np.ndarray:
@@ -29,36 +30,11 @@ def distance(
     found = np.empty(len(points))
     points = np.ascontiguousarray(points, dtype=np.float64)
     numbers = LEAST_SPAN, LEEWAY
-    _put_distances(points, *boxes, surface.triangles, surface.normals, tried, numbers, found)
+    low, high, leaves, index = samples.boxes
+    owner = samples.owner[index]
+    mesh = surface.triangles, surface.normals
+    _put_distances(points, low, high, leaves, owner, *mesh, tried, numbers, found)
     return found
-
-
-@inlined
-def _minus(a, b):
-    """Return the difference of two vectors."""
-    return add(a, b, -1.0)
-
-
-@inlined
-def _squared_gap(point, low, high):
-    """Return the squared distance of a point from a box."""
-    total = 0.0
-    for k in range(3):
-        gap = max(low[k] - point[k], point[k] - high[k], 0.0)
-        total += gap * gap
-    return total
-
-
-@inlined
-def _keep_nearest(squared, index, kept, kept_index):
-    """Insert a squared distance and its sample into the ascending list of the nearest."""
-    k = len(kept) - 1
-    while k > 0 and squared < kept[k - 1]:
-        kept[k] = kept[k - 1]
-        kept_index[k] = kept_index[k - 1]
-        k -= 1
-    kept[k] = squared
-    kept_index[k] = index
 
 
 @inlined
@@ -66,9 +42,9 @@ def _gap_from_triangle(point, corners, least_span):
     """Return (gap, feature). The gap is the vector from the closest point of a triangle to a point.
     The feature says where the closest point lies, as in `closest_on_triangles`.
     """
-    u = _minus(corners[1], corners[0])
-    v = _minus(corners[2], corners[0])
-    w = _minus(point, corners[0])
+    u = minus(corners[1], corners[0])
+    v = minus(corners[2], corners[0])
+    w = minus(point, corners[0])
     uu = dot(u, u)
     vv = dot(v, v)
     uv = dot(u, v)
@@ -84,8 +60,8 @@ def _gap_from_triangle(point, corners, least_span):
         least = np.inf
         for k in range(3):
             corner = corners[k]
-            side = _minus(corners[(k + 1) % 3], corner)
-            away = _minus(point, corner)
+            side = minus(corners[(k + 1) % 3], corner)
+            away = minus(point, corner)
             along = min(max(dot(away, side) / dot(side, side), 0.0), 1.0)
             tried = add(away, side, -along)
             squared = dot(tried, tried)
@@ -98,39 +74,6 @@ def _gap_from_triangle(point, corners, least_span):
                 elif along >= 1.0:
                     feature = 4 + (k + 1) % 3
     return gap, feature
-
-
-@inlined
-def _find_nearest(point, boxes, stack, kept, nearest):
-    """Write the nearest samples into `nearest`, which are nearer than `kept`, with their squared
-    distances.
-    """
-    low, high, samples = boxes
-    leaves, size, _ = samples.shape
-    last = len(kept) - 1
-    stack[0] = 1
-    top = 1
-    while top > 0:
-        top -= 1
-        box = stack[top]
-        if _squared_gap(point, low[box], high[box]) > kept[last]:
-            continue
-        if box >= leaves:
-            leaf = box - leaves
-            for j in range(size):
-                away = _minus(point, samples[leaf, j])
-                squared = dot(away, away)
-                if squared < kept[last]:
-                    _keep_nearest(squared, leaf * size + j, kept, nearest)
-            continue
-        # the nearer half is searched first
-        halves = 2 * box
-        first = _squared_gap(point, low[halves], high[halves])
-        second = _squared_gap(point, low[halves + 1], high[halves + 1])
-        swapped = second < first
-        stack[top] = halves if swapped else halves + 1
-        stack[top + 1] = halves + 1 if swapped else halves
-        top += 2
 
 
 @compiled
@@ -150,11 +93,11 @@ def _put_distances(points, low, high, samples, owner, triangles, normals, tried,
         point = points[i]
         bound = np.inf if i == 0 else 0.0
         for k in range(tried if i > 0 else 0):
-            away = _minus(point, samples[nearest[k] // size, nearest[k] % size])
+            away = minus(point, samples[nearest[k] // size, nearest[k] % size])
             bound = max(bound, dot(away, away))
         # these samples are found again, whatever the rounding
         kept[:] = bound * leeway
-        _find_nearest(point, boxes, stack, kept, nearest)
+        find_nearest(point, boxes, stack, kept, nearest)
         least = np.inf
         sign = 1.0
         for k in range(tried):

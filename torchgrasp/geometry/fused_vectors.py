@@ -22,6 +22,12 @@ def add(a, b, factor):
 
 
 @inlined
+def minus(a, b):
+    """Return the difference of two vectors."""
+    return add(a, b, -1.0)
+
+
+@inlined
 def scale(v, factor):
     """Return a vector times a factor, as a tuple."""
     return v[0] * factor, v[1] * factor, v[2] * factor

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchgrasp.foundation.errors import IndefiniteCovariance
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.foundation.lazy import sparse
 from torchgrasp.foundation.rules import is_known
 
@@ -193,6 +194,12 @@ def farthest_points(
     distance.
     """
     every = points.detach().cpu()
+    if distance is None and before is None and is_fused(every) and len(every):
+        from torchgrasp.geometry import fused_points  # it imports numba
+
+        rows = every.flatten(1).numpy()
+        picks = fused_points.farthest(rows, min(count, len(every)), first, tie)
+        return torch.from_numpy(picks).to(points.device)
     # NumPy is an order of magnitude faster than torch for few points.
     x = np.ascontiguousarray(every.numpy().T)
 

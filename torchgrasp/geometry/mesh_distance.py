@@ -3,10 +3,9 @@ triangles that samples of the surface tell.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.fused import is_fused
 from torchgrasp.foundation.lazy import spatial
+from torchgrasp.geometry.box_tree import Boxes, sort_into_boxes
 from torchgrasp.geometry.linalg import number_rows
 from torchgrasp.geometry.mesh import closest_on_triangles
 
@@ -41,8 +41,6 @@ class MeshDistanceNumbers:
     """Points whose distances are sought at once, which bounds memory."""
     digits: int = 9
     """Decimals [m] in which the corners of neighbouring triangles agree."""
-    box: int = 32
-    """Most samples in a leaf of the tree of boxes, which compiled loops search."""
 
 
 MESH_DISTANCE = MeshDistanceNumbers()
@@ -109,7 +107,7 @@ class MeshSurface:
         if is_fused():
             from torchgrasp.geometry import fused_distance  # it imports numba
 
-            return fused_distance.distance(points, samples.boxes, self, tried)
+            return fused_distance.distance(points, samples, self, tried)
         parts = []
         for begin in range(0, max(1, len(points)), MESH_DISTANCE.at_once):
             part = points[begin : begin + MESH_DISTANCE.at_once]
@@ -127,19 +125,6 @@ class MeshSurface:
         return np.concatenate(parts)
 
 
-class Boxes(NamedTuple):
-    """A balanced tree of boxes around the samples of a surface, for compiled loops.
-
-    The root is box 1, and box i holds boxes 2 i and 2 i + 1. The last l boxes are leaves. There is
-    no box 0.
-    """
-
-    low: np.ndarray  # least coordinates (2 l, 3) [m] of the samples in a box
-    high: np.ndarray  # greatest coordinates (2 l, 3) [m]
-    samples: np.ndarray  # points (l, s, 3) [m] of each leaf; NaN fills the last of them up
-    owner: np.ndarray  # triangle (l, s) of each sample
-
-
 class Samples:
     """Points (s, 3) [m] of a surface and their triangles (s,), to find the nearest of them."""
 
@@ -154,28 +139,8 @@ class Samples:
 
     @cached_property
     def boxes(self) -> Boxes:
-        """The same points in a tree of boxes, each of which is halved across its longest side."""
-        count = len(self.points)
-        leaves = 2 ** max(math.ceil(math.log2(count / MESH_DISTANCE.box)), 0)
-        missing = -count % leaves
-        # NaN comes last, and is neither the least nor the greatest of several
-        points = np.pad(self.points.T, ((0, 0), (0, missing)), constant_values=np.nan)
-        owner = np.pad(self.owner, (0, missing))
-        low = []
-        high = []
-        for boxes in 2 ** np.arange(leaves.bit_length()):
-            points = points.reshape(3, boxes, -1)
-            owner = owner.reshape(boxes, -1)
-            low.append(np.fmin.reduce(points, 2))
-            high.append(np.fmax.reduce(points, 2))
-            if boxes < leaves:
-                longest = (high[-1] - low[-1]).argmax(0)
-                along = np.take_along_axis(points, longest[None, :, None], 0)[0]
-                order = np.argpartition(along, along.shape[1] // 2, 1)
-                points = np.take_along_axis(points, order[None], 2)
-                owner = np.take_along_axis(owner, order, 1)
-        low, high = (np.concatenate([each[0], *each], 1).T for each in (low, high))
-        return Boxes(low.copy(), high.copy(), points.transpose(1, 2, 0).copy(), owner)
+        """The points in a tree of boxes, for compiled loops."""
+        return sort_into_boxes(self.points)
 
 
 def _places(corners: np.ndarray) -> np.ndarray:

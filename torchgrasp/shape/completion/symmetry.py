@@ -15,7 +15,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.foundation.lazy import spatial
+from torchgrasp.geometry.box_tree import Boxes, sort_into_boxes
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import (
     Points,
@@ -178,6 +180,11 @@ class SymmetryScorer:
         """The k-d tree over all points of the cloud, for finding nearest neighbours."""
         return spatial.KDTree(self.points.numpy(), leafsize=SYMMETRY.leaf)
 
+    @functools.cached_property
+    def boxes(self) -> Boxes:
+        """The same points in a tree of boxes, for compiled loops."""
+        return sort_into_boxes(self.points.numpy())
+
     @property
     def center(self) -> Tensor:
         """Centre (3,) [m] of the cloud's bounding box."""
@@ -197,10 +204,16 @@ class SymmetryScorer:
 
         The distance is in metres. If no point is within the `limit` [m], they are infinity and 0.
         """
-        distance, index = self.tree.query(points.reshape(-1, 3).numpy(), distance_upper_bound=limit)
+        rows = points.reshape(-1, 3).numpy()
+        if is_fused(points):
+            from torchgrasp.geometry import fused_points  # it imports numba
+
+            distance, index = fused_points.nearest(rows, self.boxes, limit)
+        else:
+            distance, index = self.tree.query(rows, distance_upper_bound=limit)
+            index = np.where(np.isinf(distance), 0, index)
         shape = points.shape[:-1]
-        index = torch.from_numpy(np.where(np.isinf(distance), 0, index)).reshape(shape)
-        return torch.from_numpy(distance).reshape(shape), index
+        return torch.from_numpy(distance).reshape(shape), torch.from_numpy(index).reshape(shape)
 
     def score(
         self,

@@ -1,0 +1,44 @@
+"""A balanced tree of boxes around points, in arrays that compiled loops search."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+LEAF = 32  # most points in a leaf: a loop tries them faster than it opens further boxes
+
+
+class Boxes(NamedTuple):
+    """A tree of boxes: the root is box 1, and box i holds boxes 2 i and 2 i + 1.
+
+    The last l boxes are leaves. There is no box 0.
+    """
+
+    low: np.ndarray  # least coordinates (2 l, 3) of the points in a box
+    high: np.ndarray  # greatest coordinates (2 l, 3)
+    points: np.ndarray  # points (l, s, 3) of each leaf; NaN fills the last of them up
+    rows: np.ndarray  # index (l, s) of each of these points among the given ones
+
+
+def sort_into_boxes(points: np.ndarray) -> Boxes:
+    """Return points (n, 3) in a tree of boxes, each of which is halved across its longest side."""
+    leaves = 2 ** max(math.ceil(math.log2(len(points) / LEAF)), 0)
+    missing = -len(points) % leaves
+    # NaN comes last, and is neither the least nor the greatest of several
+    left = np.pad(points.T, ((0, 0), (0, missing)), constant_values=np.nan)
+    index = np.pad(np.arange(len(points)), (0, missing))
+    low = []
+    high = []
+    for boxes in 2 ** np.arange(leaves.bit_length()):
+        left = left.reshape(3, boxes, -1)
+        index = index.reshape(boxes, -1)
+        low.append(np.fmin.reduce(left, 2))
+        high.append(np.fmax.reduce(left, 2))
+        if boxes < leaves:
+            longest = (high[-1] - low[-1]).argmax(0)
+            along = np.take_along_axis(left, longest[None, :, None], 0)[0]
+            order = np.argpartition(along, along.shape[1] // 2, 1)
+            left = np.take_along_axis(left, order[None], 2)
+            index = np.take_along_axis(index, order, 1)
+    low, high = (np.concatenate([each[0], *each], 1).T.copy() for each in (low, high))
+    return Boxes(low, high, left.transpose(1, 2, 0).copy(), index)

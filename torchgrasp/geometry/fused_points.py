@@ -1,0 +1,122 @@
+"""Nearest and farthest points, as compiled loops."""
+
+import numpy as np
+
+from torchgrasp.foundation.fused import compiled, inlined
+from torchgrasp.geometry.box_tree import Boxes
+from torchgrasp.geometry.fused_vectors import dot, minus
+
+
+def nearest(points: np.ndarray, boxes: Boxes, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return distance (n,) and index (n,) of the point in `boxes` that is nearest to each of the
+    points (n, 3).
+
+    Where none is nearer than `limit`, they are infinity and 0.
+    """
+    distance = np.empty(len(points))
+    index = np.empty(len(points), np.int64)
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    _put_nearest(points, *boxes, limit * limit, distance, index)
+    return distance, index
+
+
+def farthest(points: np.ndarray, count: int, first: int, tie: float) -> np.ndarray:
+    """Return the indices of `count` points (n, d), as `farthest_points` chooses them."""
+    picks = np.full(count, first)
+    _put_farthest(np.ascontiguousarray(points), tie, picks)
+    return picks
+
+
+@inlined
+def _squared_gap(point, low, high):
+    """Return the squared distance of a point from a box."""
+    total = 0.0
+    for k in range(3):
+        gap = max(low[k] - point[k], point[k] - high[k], 0.0)
+        total += gap * gap
+    return total
+
+
+@inlined
+def _keep_nearest(squared, index, kept, kept_index):
+    """Insert a squared distance and its sample into the ascending list of the nearest."""
+    k = len(kept) - 1
+    while k > 0 and squared < kept[k - 1]:
+        kept[k] = kept[k - 1]
+        kept_index[k] = kept_index[k - 1]
+        k -= 1
+    kept[k] = squared
+    kept_index[k] = index
+
+
+@inlined
+def find_nearest(point, boxes, stack, kept, nearest):
+    """Write the nearest samples into `nearest`, which are nearer than `kept`, with their squared
+    distances.
+    """
+    low, high, samples = boxes
+    leaves, size, _ = samples.shape
+    last = len(kept) - 1
+    stack[0] = 1
+    top = 1
+    while top > 0:
+        top -= 1
+        box = stack[top]
+        if _squared_gap(point, low[box], high[box]) > kept[last]:
+            continue
+        if box >= leaves:
+            leaf = box - leaves
+            for j in range(size):
+                away = minus(point, samples[leaf, j])
+                squared = dot(away, away)
+                if squared < kept[last]:
+                    _keep_nearest(squared, leaf * size + j, kept, nearest)
+            continue
+        # the nearer half is searched first
+        halves = 2 * box
+        first = _squared_gap(point, low[halves], high[halves])
+        second = _squared_gap(point, low[halves + 1], high[halves + 1])
+        swapped = second < first
+        stack[top] = halves if swapped else halves + 1
+        stack[top + 1] = halves + 1 if swapped else halves
+        top += 2
+
+
+@compiled
+def _put_nearest(points, low, high, leaves, order, limit, distance, index):
+    """Write the results of `nearest`; `limit` is squared."""
+    boxes = low, high, leaves
+    stack = np.empty(len(low), np.int64)
+    kept = np.empty(1)
+    found = np.empty(1, np.int64)
+    size = leaves.shape[1]
+    for i in range(len(points)):
+        kept[0] = limit
+        found[0] = -1
+        find_nearest(points[i], boxes, stack, kept, found)
+        distance[i] = np.inf
+        index[i] = 0
+        if found[0] >= 0:
+            distance[i] = np.sqrt(kept[0])
+            index[i] = order[found[0] // size, found[0] % size]
+
+
+@compiled
+def _put_farthest(points, tie, picks):
+    """Write the choice of `farthest`, whose first index `picks` has."""
+    n, d = points.shape
+    gap = np.full(n, np.inf)
+    for k in range(1, len(picks)):
+        most = 0.0
+        for i in range(n):
+            squared = 0.0
+            for j in range(d):
+                off = points[i, j] - points[picks[k - 1], j]
+                squared += off * off
+            gap[i] = min(gap[i], squared)
+            most = max(most, gap[i])
+        # the first of the largest
+        for i in range(n):
+            if gap[i] >= (1.0 - tie) * most:
+                picks[k] = i
+                break
