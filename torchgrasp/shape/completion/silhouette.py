@@ -278,16 +278,16 @@ def silhouette(view: PointCloud) -> Silhouette:
     order = np.argsort(-depths)
     raster = np.zeros(shape)
     raster[row[order], column[order]] = depths[order]
-    nearest = np.asarray(
-        ndimage.distance_transform_edt(raster == 0, return_distances=False, return_indices=True)
-    )
+    away, nearest = ndimage.distance_transform_edt(raster == 0, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
 
-    measured = _distance(raster == 0) * cell <= disc
+    measured = away * cell <= disc
     grown = np.asarray(ndimage.binary_fill_holes(measured))
     gaps = grown & ~measured
-    widest = float(_distance(gaps).max()) * cell
-    gap = 2 * (widest + disc) * bool(gaps.any())
-    grown &= ~_find_holes(gaps, measured, disc / cell)
+    gap = 0.0
+    if gaps.any():
+        within = _distance(gaps)
+        gap = 2 * (float(within.max()) * cell + disc)
+        grown &= ~_find_holes(gaps, within, measured, disc / cell)
     inside = _distance(grown) * cell > OUTLINE.shrink * spacing
     unseen = _beyond_image(view.frustum, axes, corner, cell, grown, disc)
     inside |= unseen
@@ -317,21 +317,23 @@ def silhouette(view: PointCloud) -> Silhouette:
 
 def _find_holes(
     gaps: np.ndarray,
+    within: np.ndarray,
     measured: np.ndarray,
     grown: float,
 ) -> np.ndarray:
     """Return the cells of gaps that are over twice as wide as all surface around them.
 
-    The surface is the mask `measured`, which was grown by so many cells.
+    The surface is the mask `measured`, which was grown by so many cells. `within` is the distance
+    [cells] of each cell of a gap to the gap's border.
     """
     number, count = ndimage.label(gaps)  # pyright: ignore[reportGeneralTypeIssues]
-    wide = _distance(measured)
     holes = np.zeros_like(gaps)
-    radii = ndimage.maximum(_distance(gaps), number, range(1, count + 1)) + grown
+    radii = ndimage.maximum(within, number, range(1, count + 1)) + grown
     for k, radius in enumerate(radii, start=1):
         if radius > 2 * grown:  # a narrower gap lies between sparse points
             around = measured & (_distance(number != k) < 2 * radius)
-            holes |= (number == k) & (2 * (wide[around].max() - grown) < radius)
+            wide = _distance(measured)[around].max()
+            holes |= (number == k) & (2 * (wide - grown) < radius)
     return holes
 
 
