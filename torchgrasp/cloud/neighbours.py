@@ -91,6 +91,12 @@ def is_flat(points: Points) -> bool:
     points = points[find_inliers(points)]
     spread = torch.linalg.svdvals(points - points.mean(0)) / math.sqrt(len(points))
     thickness, _, length = spread.sort().values.tolist()
+    # a quadric errs by no more than a plane, which is found sooner
+    distance, index = nearest(points, NEAR.quadric)
+    mean_squares, _ = _principal_axes(points[index], _weigh(distance))
+    most = 2 * float(mean_squares[:, 0].clamp_min(0).sqrt().median())
+    if thickness >= max(most, NEAR.thin * length):
+        return False
     return thickness < max(2 * float(fit_quadrics(points)[2].median()), NEAR.thin * length)
 
 
