@@ -24,7 +24,6 @@ from torchgrasp.geometry.linalg import (
     perpendicular,
     unit,
 )
-from torchgrasp.hand.drives import joint_stiffness
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.sample import sample_configurations
 
@@ -252,11 +251,12 @@ def _stiffness(
     """Return the stiffness [N/m] of each fingertip, turned into the posture's frame.
 
     It is the inverse of a compliance: J K^-1 J^T plus that of gears and links. J is the Jacobian,
-    and K the stiffness of the joints with those coupled to them. `feet` [m] are the tips' lowest
-    points in the hand's frame.
+    and K the stiffness of the actuated joints, without those coupled to them. `feet` [m] are the
+    tips' lowest points in the hand's frame.
     """
     jacobian = turn[:, None] @ hand.jacobian(joints, feet)  # (p, f, 3, h)
-    compliance = (jacobian / joint_stiffness(hand).to(jacobian)) @ jacobian.mT
+    kp = jacobian.new_tensor([hand.actuators[name].kp for name in hand.joint_names])
+    compliance = (jacobian / kp) @ jacobian.mT
     return torch.linalg.inv(compliance + PRESS.compliance * eye_like(3, jacobian))
 
 
