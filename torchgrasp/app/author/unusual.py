@@ -25,10 +25,8 @@ class UsualNumbers:
 
     size: Bounds = (1e-3, 0.6)  # longest edge of a link [m]: a forearm is the largest
     place: Bounds = (0.0, 0.6)  # distance of a joint from the joint before it [m]
-    apart: Bounds = (
-        0.0,
-        0.3,
-    )  # distance of the first joints of two fingers [m]: more are two hands
+    # distance of the first joints of two fingers [m]: more are two hands
+    apart: Bounds = (0.0, 0.3)
     turn: Bounds = (0.05, 3.6)  # range of a revolute joint [rad]: half a turn and some degrees
     slide: Bounds = (1e-3, 0.2)  # range of a sliding joint [m]
     # effort of a revolute joint [N m]: more is a placeholder, or in N mm
