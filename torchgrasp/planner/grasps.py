@@ -147,11 +147,9 @@ def plan_grasps(
 
     Raises:
         BadArgument: an argument of the wrong type or range; a bad file of cloud or hand.
-        BadArgument: an object that is not of graspable size; a scene without a target.
-        BadArgument: a camera that cannot have seen the points.
-        BadArgument: a table above most points or a camera, or more than 2 m below the object's top.
-        BadArgument: `keep` off the object; an `arm` of another hand.
-        BadArgument: a `promise` for a displaced object.
+        BadArgument: an object of no graspable size; no target; a camera that cannot have seen it.
+        BadArgument: a table above most points or a camera, or over 2 m below the top; `keep` off
+            the object; an `arm` of another hand; a `promise` for a displaced object.
         BadArgument: `shape`, `arm`, `observer`, `reachable` or a region beside several clouds.
         MissingExtra, NoWorkers: pebble or numba is not installed, or no worker process can start.
 
