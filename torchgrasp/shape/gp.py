@@ -214,7 +214,7 @@ class ShapeGP(Posterior, Normalisation):
         tensor(True)
         """
         evaluate = self.estimate if covariance else self._estimate_distance
-        mean, spread = self._extend(evaluate, self._queries(points, 2.0))
+        mean, spread = self._evaluate_anywhere(evaluate, self._queries(points, 2.0))
         variance = spread[:, 0, 0]
         std_m = self.std_factor * self.scale * surface_deviation(variance, mean[:, 1:])
         return ShapeEstimate(
@@ -443,7 +443,7 @@ class ShapeGP(Posterior, Normalisation):
         mean = torch.cat([distance[:, None], gradient], 1)
         return mean, self.variance(x)[:, None, None]
 
-    def _extend(
+    def _evaluate_anywhere(
         self,
         evaluate: Callable[[Queries], MeanAndSpread],
         x: Queries,

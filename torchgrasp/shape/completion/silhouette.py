@@ -328,12 +328,15 @@ def _find_holes(
     """
     number, count = ndimage.label(gaps)  # pyright: ignore[reportGeneralTypeIssues]
     holes = np.zeros_like(gaps)
-    radii = ndimage.maximum(within, number, range(1, count + 1)) + grown
-    for k, radius in enumerate(radii, start=1):
-        if radius > 2 * grown:  # a narrower gap lies between sparse points
-            around = measured & (_distance(number != k) < 2 * radius)
-            wide = _distance(measured)[around].max()
-            holes |= (number == k) & (2 * (wide - grown) < radius)
+    radii = np.asarray(ndimage.maximum(within, number, range(1, count + 1))) + grown
+    suspects = np.flatnonzero(radii > 2 * grown)  # a narrower gap lies between sparse points
+    if not len(suspects):
+        return holes
+    wide = _distance(measured)
+    for k in suspects:
+        own = number == k + 1
+        around = measured & (_distance(~own) < 2 * radii[k])
+        holes |= own & (2 * (wide[around].max() - grown) < radii[k])
     return holes
 
 
