@@ -81,7 +81,7 @@ class Arm(Value):
         features: the tip's pose in each posture of the library as twelve numbers (m, 12) [mm]. They
             are its position, then the entries of its rotation matrix times 71 mm. The Euclidean
             distance of two rows is a distance of two poses.
-        hand_sha256: SHA-256 of the files of the hand, by which `plan_grasps` knows it.
+        hand_sha256: SHA-256 of the files of the hand, by which `plan_grasps` recognises it.
     """
 
     urdf: Urdf = dataclasses.field(repr=False)
@@ -125,16 +125,16 @@ class Arm(Value):
         They are in the object's frame, that of `obj_from_base`.
 
         Args:
-            joints: positions (k, n) of the arm's joints [rad, or m for sliding joints].
+            joints: positions (k, n) of the arm's n joints [rad, or m for sliding joints].
         """
         return self.obj_from_base @ self.tree.poses(joints)[:, -1] @ self.tip_from_hand
 
     @checked
     def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> TipPoses:
-        """Return the poses (3, 4, k) [m] of the tip at which the hand has k given poses.
+        """Return the poses (3, 4, k) [m] of the arm's tip for k given poses of the hand.
 
         They are in the frame of the arm's root link. The last row (0, 0, 0, 1) of each matrix is
-        left out. The joints that reach them are not computed.
+        left out. No inverse kinematics is solved.
 
         Args:
             obj_from_hand: poses (k, 4, 4) [m] of the hand's root link in the object's frame.
@@ -145,15 +145,15 @@ class Arm(Value):
 
     @checked
     def tip_motion(self, joints: Float[Tensor, "n k"]) -> tuple[TipPoses, Float[Tensor, "6 n k"]]:
-        """Return (poses, motion): the tip's pose and its Jacobian in k postures.
+        """Return (poses, jacobian): the tip's pose and its Jacobian in k postures.
 
-        Both are in the frame of the arm's root link. `poses` (3, 4, k) [m] are without the last row
-        (0, 0, 0, 1) of each matrix. `motion` (6, n, k) is the derivative by each of the n joints
-        [mm per rad or m]. Its rows 0 to 2 are that of the position. Rows 3 to 5 are that of the
-        rotation vector, times a hand's depth of 100 mm (`LEVER`). So they are in mm, too.
+        Both are in the frame of the arm's root link. `poses` (3, 4, k) [m] lack the last row (0, 0,
+        0, 1) of each matrix. `jacobian` (6, n, k) [mm/rad, or mm/m for sliding joints] has a column
+        for each of the n joints. Rows 0 to 2 are for the position. Rows 3 to 5 are for the rotation
+        vector. They are multiplied by a hand's depth of 100 mm (`LEVER`), to have the same unit.
 
         Args:
-            joints: positions (n, k) of the arm's joints [rad, or m for sliding joints].
+            joints: positions (n, k) of the arm's n joints [rad, or m for sliding joints].
         """
         frames = self.tree.frames(joints)
         tip = frames[:, :, -1]
@@ -171,7 +171,7 @@ class Arm(Value):
         object's frame.
 
         Args:
-            joints: positions (n, k) of the arm's joints [rad, or m for sliding joints].
+            joints: positions (n, k) of the arm's n joints [rad, or m for sliding joints].
         """
         frames = self.tree.frames(joints.contiguous()).index_select(2, self.link)
         pose = self.obj_from_base
@@ -218,8 +218,8 @@ def load_arm(
         urdf: path of the file. Joint limits are cut to [-2 pi, 2 pi] rad; a joint without limits
             gets this range.
         hand: the hand on the arm, or its name, or its folder.
-        tip: name of the link that carries the hand. None means the link that is moved by the most
-            joints. Of several such links it is the last in the file.
+        tip: name of the link that carries the hand. None means the link that the most joints move.
+            Of several such links, it means the last one in the file.
         obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the cloud that is
             planned on. None means the identity.
         tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip; None means

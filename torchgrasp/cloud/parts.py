@@ -113,7 +113,7 @@ def cut_object(
         up: unit vector (3,) that points up, in the frame of the cloud.
         point: position (3,) [m] on or near the object, in the frame of the cloud. Points more than
             0.5 m away (`PARTS.around`) are left out first. None means the object with the most
-            points over the region of the plane.
+            points above the supporting area of the plane.
         box: two opposite corners (2, 3) [m] of a box along the axes of the cloud's frame. Points
             outside are left out first. None means no box.
         gap: distance [m] beyond which points belong to different objects, 0.001 to 1.

@@ -76,7 +76,7 @@ class NormalCheck(Value):
     """How well the normals of a cloud agree with the normals of neighbouring points.
 
     `diagnose_cloud` makes it (`CloudReport.normals`) for n points: all distinct points of the
-    cloud, or 5000 drawn ones. It does not tell which ones were drawn.
+    cloud, or 5000 of them drawn at random. It does not hold which ones.
 
     Attributes:
         flipped: mask (n,) of the normals that oppose most of their neighbours' normals. Its mean is
@@ -200,9 +200,9 @@ def _seen_by_pixels(points: Points, normals: Points | None, up: Vector | None) -
 def estimate_normals(cloud: PointCloud) -> PointCloud:
     """Return the cloud without duplicate points, and with fitted outward unit normals.
 
-    Each normal is that of a quadric surface fitted around the point. It replaces a given normal. It
-    points to the viewpoint. Without a viewpoint it points to the side of the given normal. Without
-    both, the viewpoint is estimated, and the result has this viewpoint.
+    Each normal is that of a quadric surface fitted around the point, and replaces a given normal.
+    It points towards the viewpoint. Without a viewpoint, it points to the side of the given normal.
+    Without both, the viewpoint is estimated, and the result has this viewpoint.
 
     Raises the errors of `check_cloud`.
 
@@ -304,7 +304,7 @@ def merge_clouds(
 
     Views without normals get those of `estimate_normals`. The result has a `viewpoint`, unless a
     view has normals but no viewpoint. Points are denser where views overlap; `voxel_downsample`
-    evens the density.
+    makes the density even.
 
     Overlapping views are compared. If they are farther apart than noise explains, `MendedInput`
     warns. Their distance becomes the result's `pose_error` [m], which widens the standard

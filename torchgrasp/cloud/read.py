@@ -155,8 +155,8 @@ def read_cloud_file(
     viewpoint: Sequence[float | int] | Tensor | None = None,
     unit: Literal["m", "cm", "mm"] = "m",
 ) -> CloudFile:
-    """Read a cloud of any extent, such as a whole scene. Its table and notes on what was left out
-    come with it.
+    """Read a cloud of any extent, such as a whole scene. The result also has its table, and notes
+    on what was left out.
 
     Formats, arguments and what is left out are those of `read_cloud`.
 

@@ -126,18 +126,19 @@ class SensorNoise(Value):
             and at which all are missing.
         multipath: error of a time-of-flight camera in a corner (no unit). The measured depth is too
             great by this factor times the corner's depth behind its surroundings.
-        fine: standard deviation of a second disparity noise [px], in patches of a pixel; only with
-            a `base`.
+        fine: standard deviation [px] of a second noise of the disparity, in patches of about a
+            pixel; only with a `base`.
         smoothing: standard deviation [px] of the blur by the matching window, within each surface:
             it rounds edges.
-        worn: mean width [px] of the strip that is lost along rims. Each view has its own, up to
-            twice as much, and it waves as wide as holes are.
+        worn: mean width [px] of the strip that is lost along rims. Each view draws its own width,
+            up to twice the mean. The width varies along the rim, over about `hole_width`.
         holes: share [0 to 1] of pixels that are lost in patches, as on dark and shiny parts.
         hole_width: width [px] of these patches.
-        crop: height [m] above the lowest point, along z of the frame of `partial_view`. Below it,
-            whoever cut the table away took the object, too. Depth images are not cropped.
-        misplaced: standard deviation [m] on each axis by which a calibration is off. It moves the
-            points of `partial_view` with their camera. Depth images do not move.
+        crop: height [m] above the lowest point, along z of the frame of `partial_view`. Points
+            below it are missing, as after a rough removal of the table. Depth images are not
+            cropped.
+        misplaced: standard deviation [m] along each axis of an error of the camera's calibration.
+            It moves the points of `partial_view` with their camera. Depth images do not move.
 
     >>> float(SENSORS["kinect_v1"].sigma(torch.tensor(2.0))) < 0.007
     True
@@ -400,8 +401,8 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
 
     Raises:
         BadArgument: no frame, or frames of several sizes or dtypes.
-        BadArgument: camera or scene have moved. This is so if a frame differs from the median in
-            more than 5 % of its pixels. It is so, too, for 1 % of its patches (`STILL`).
+        BadArgument: camera or scene have moved: a frame differs from the median in more than 5 % of
+            its pixels, or 1 % of its patches (`STILL`).
 
     >>> frames = [[[0.0, 0.7]], [[0.0, 0.701]], [[0.5, 0.702]]]
     >>> median_depth([torch.tensor(frame) for frame in frames])

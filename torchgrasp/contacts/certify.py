@@ -59,15 +59,15 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     friction cones, with their torques. They are the columns of W. Coefficients phi with W phi = 0
     and sum phi = 1 balance them. The margin is the largest s with phi >= s for such a phi, or -inf
     without one. A set is `closed` if its margin is at least 1e-6 (`MIN_MARGIN`) and its
-    `rank_ratio` at least 1e-3 (`MIN_RANK_RATIO`). Then its contacts must not lie almost on a line,
-    and phi must balance W up to rounding.
+    `rank_ratio` at least 1e-3 (`MIN_RANK_RATIO`). In addition, its contacts must not lie almost on
+    a line, and phi must balance W up to rounding.
 
     If a set is not closed, its `witness` is a unit wrench v that no contact force opposes. For
     every edge wrench w then v . w >= 0, up to rounding. If only the rank is too low, the wrenches
     are smallest along v. A set with a contact that is not finite is not closed. Its margin and
     witness are NaN.
 
-    The margin has a first derivative by points and normals:
+    The margin has a first derivative with respect to points and normals:
 
     * At a kink, where several derivatives are possible, it is one of them.
     * Where the margin is greatest (all phi are equal), it is 0.
@@ -176,7 +176,9 @@ class _Proof(torch.autograd.Function):
 
 
 class _Once(torch.autograd.Function):
-    """The first derivative of the margin by the `wrench`; a second derivative is an error."""
+    """The first derivative of the margin with respect to the `wrench`; a second derivative is an
+    error.
+    """
 
     generate_vmap_rule = True
 

@@ -255,7 +255,7 @@ class ClosureProbability(Batch):
     Attributes:
         probability: share (b,) of random surfaces on which the set has force closure, in [0, 1].
         standard_error: standard error (b,) of the probability. If k of n surfaces give force
-            closure, it is that of a share (k + 1) / (n + 2), and so never 0.
+            closure, it is that of a share (k + 1) / (n + 2). So it is never 0.
 
     >>> ClosureProbability(torch.tensor([0.97]), torch.tensor([0.01])).probability
     tensor([0.9700])
@@ -294,8 +294,8 @@ def closure_probability(
         n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)).
         seed: random seed.
 
-    Raises `BadArgument` for a contact that is not finite, or outside the shape's domain or at its
-    edge. Raises it also for another wrong argument.
+    Raises `BadArgument` for a contact that is not finite, or is outside the shape's domain or at
+    its edge. It is also raised for a wrong argument.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -135,15 +135,15 @@ def hold_probability(
     """Return the probability (b,) that each contact set has force closure, for uncertain friction,
     finger placement, normals and object pose.
 
-    With a `weight`, the result is the probability that forces in the friction cones balance it.
-    They have the mean normal force `weight.press`. With a `shape`, the result is the mean over
-    random surfaces.
+    With a `weight`, the result is the probability that forces in the friction cones balance it. The
+    mean normal force is then `weight.press`. With a `shape`, the result is the mean over random
+    surfaces.
 
     If only the friction is uncertain, the result is exact. It is the probability that the friction
-    exceeds the `critical_friction`, and 0 where that is infinite. The other errors count by the
-    mean over a fixed set of 64 errors. Around each of these, smaller errors count to first order.
-    The result is 0 for the few sets for which the method does not converge. Most of them carry a
-    load far below the normal forces.
+    exceeds the `critical_friction`, and 0 where that is infinite. For the other errors, the result
+    is the mean over a fixed set of 64 samples of them. The rest of the error around each sample is
+    included to first order. The result is 0 for the few sets for which the method does not
+    converge. Most of these carry a load far below the normal forces.
 
     Args:
         contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals.
@@ -156,11 +156,11 @@ def hold_probability(
             error moves all contacts together along the surface.
         turn: standard deviation [rad] of the object's rotation about each of three axes through the
             contacts' centroid.
-        weight: the weight that the contacts carry. None means that they must resist any load, and
-            that the fingertips press as much as it needs.
+        weight: the weight that the contacts carry. None means that they must resist any load, with
+            normal forces as large as needed.
         shape: the uncertain shape in the frame of the contacts. Random surfaces are drawn from it
-            as in `closure_probability`. With each surface goes one set of the other errors. None
-            means that the planned contacts lie on the true surface.
+            as in `closure_probability`. One sample of the other errors is used with each surface.
+            None means that the planned contacts lie on the true surface.
         draws: number of random surfaces, if there is a `shape`.
         seed: random seed of the surfaces.
 
@@ -386,8 +386,8 @@ def _tilts(tilt: float | Tensor, points: Vectors) -> Float[Tensor, "b f"]:
 def sensitivities(
     points: Vectors, normals: Vectors, balance: LeastBalance
 ) -> tuple[Vectors, Vectors]:
-    """Return the derivatives of the critical friction by points [1/m] and by normals, along the
-    surface. `balance` is that of the contacts.
+    """Return the derivatives of the critical friction with respect to points [1/m] and normals,
+    along the surface. `balance` is that of the contacts.
     """
     _, radius = centre_and_radius(points)
     rotation = balance.twist[:, None, 3:].expand_as(points)

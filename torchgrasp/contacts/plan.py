@@ -55,7 +55,7 @@ def plan_contacts(
     A set has `spec.fingertips` contacts. `ContactPlan.status` of a failed set is the `Status` of
     the first constraint that it violates. If the solver fails from a feasible initial guess, the
     guess itself is the result. Without `time_budget` the result is deterministic. Guesses are drawn
-    in chunks of 500. So a plan from 500 or 1000 guesses is the beginning of a plan from more.
+    in chunks of 500. So a plan from 500 or 1000 guesses equals the first part of a plan from more.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods (`ShapeLike`).
@@ -66,9 +66,11 @@ def plan_contacts(
         time_budget: wall time [s] of the call. The result then holds the first guesses that could
             be planned in this time, but at least 25 (`LEAST_STARTS`). None means all.
 
-    Raises `BadArgument` for a number of `starts` that is not positive. Raises it also for guesses
-    of a wrong shape or outside the shape's domain. Raises it for a `spec.start_radius` beyond this
-    domain, too.
+    Raises `BadArgument` for:
+
+    * a number of `starts` that is not positive;
+    * guesses of a wrong shape, or outside the domain of `shape`;
+    * a `spec.start_radius` beyond this domain.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> plan = plan_contacts(fit_shape(load_object("jug").view), ContactSpec.paper(), starts=8)

@@ -69,7 +69,7 @@ class ShapeLike(Protocol):
     @property
     def domain_radius(self) -> PerRow:
         """The radius, normalised, of the ball about the normalised origin in which the shape is
-        known: a number, or (b,) as for `scale`.
+        known: a number, or (b,) as for `scale`. One normalised unit is `scale` [m].
         """
         ...
 
@@ -81,11 +81,12 @@ class ShapeLike(Protocol):
         ...
 
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
-        """Return mean and variance of the signed distance with derivatives, at q points `x` (q, 3).
+        """Return mean and variance of the signed distance with their derivatives, at q normalised
+        points `x` (q, 3).
 
-        Points and results are normalised. The fields of the `torchgrasp.shape.SurfaceJet` are
-        `distance` (q,), `gradient` (q, 3), `hessian` (q, 3, 3), `variance` (q,) and
-        `variance_gradient` (q, 3).
+        Results are normalised: one unit is `scale` [m]. The fields of the
+        `torchgrasp.shape.SurfaceJet` are `distance` (q,), `gradient` (q, 3), `hessian` (q, 3, 3),
+        `variance` (q,) and `variance_gradient` (q, 3).
         """
         ...
 
@@ -220,8 +221,8 @@ def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Tensions]:
 
 @dataclasses.dataclass(frozen=True)
 class Constraints(Batch):
-    """Values of all constraints, and their Jacobians by the u unknowns: 3 f point coordinates, then
-    p tensions.
+    """Values of all constraints, and their Jacobians with respect to the u unknowns: 3 f point
+    coordinates, then p tensions.
 
     `centre` (normalised) is the centroid of the f contacts, and `surface` (normalised) their signed
     distances from the surface. Both should be 0. The k numbers in `bounds` should be <= 0. First
@@ -248,7 +249,7 @@ class Constraints(Batch):
 
     @property
     def jacobian(self) -> Float[Tensor, "b r u"]:
-        """The Jacobian of the r constraint `values` by the u unknowns."""
+        """The Jacobian of the r constraint `values` with respect to the u unknowns."""
         return torch.cat([self.centre_by_x, self.surface_by_x, self.bounds_by_x], 1)
 
 
@@ -518,10 +519,10 @@ class ContactProblem:
 
 
 def _by_own_point(slope: Vectors, unknowns: int) -> Float[Tensor, "b f u"]:
-    """Return the Jacobian of f values by all u unknowns, where each value depends only on its own
-    contact.
+    """Return the Jacobian of f values with respect to all u unknowns. Each value depends only on
+    its own contact.
 
-    `slope` (b, f, 3) holds the derivatives by the coordinates of the contact.
+    `slope` (b, f, 3) holds the derivatives with respect to the coordinates of the contact.
     """
     b, f = slope.shape[:2]
     jacobian = slope.new_zeros(b, f, unknowns)

@@ -42,9 +42,10 @@ class Region(Value):
         distance: function of points (n, 3) [m] in float64 that returns their signed distances (n,)
             [m], negative inside.
         name: name of the region in errors.
-        placed: whether the region must be at the object, as a box or a mesh. It may be off the
-            cloud and the space behind the cloud. Then planning raises `BadArgument` for `keep`, and
-            warns `NoEffect` for `avoid`. If it holds all of both, `keep` warns `NoEffect`.
+        placed: whether the region must overlap the object, as a box or a mesh must. The object is
+            the cloud and the space behind it. Without an overlap, planning raises `BadArgument` for
+            `keep`, and warns `NoEffect` for `avoid`. If the region holds the whole object, planning
+            warns `NoEffect` for `keep`.
 
     >>> from torchgrasp import load_object
     >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)
@@ -84,7 +85,7 @@ class Region(Value):
     def box(
         cls, low: Float[Tensor, "3"], high: Float[Tensor, "3"], obj_from_box: Pose | None = None
     ) -> "Region":
-        """Return the inside of a box.
+        """Return the region inside a box.
 
         Args:
             low: least coordinates (3,) [m] of the box, in the box's frame.
@@ -114,7 +115,7 @@ class Region(Value):
     @classmethod
     @checked
     def mesh(cls, mesh: "trimesh.Trimesh | Path | str") -> "Region":
-        """Return the inside of a closed mesh.
+        """Return the region inside a closed mesh.
 
         `mesh` is a trimesh, or an .obj, .off, .ply or .stl file. It is in metres, in the frame of
         the cloud. Raises `MeshError` for a mesh that is missing, malformed, open, turned inward, or
@@ -133,10 +134,10 @@ class Region(Value):
     @classmethod
     @checked
     def mask(cls, scene: Scene, mask: Bool[Tensor, "h w"]) -> "Region":
-        """Return the space that the pixels of a mask (h, w) cover, as the scene's camera sees it.
+        """Return the region that the pixels of a mask (h, w) cover, as the scene's camera sees it.
 
-        The region is in the frame of the scene. It reaches through the object, so that it also
-        holds places on the hidden side. Points outside the image are outside.
+        The region is in the frame of the scene. It reaches through the object, so it also holds
+        points on the hidden side. Points outside the image are outside.
 
         Args:
             scene: the scene, whose image has h rows and w columns.
@@ -169,10 +170,10 @@ class Region(Value):
     @classmethod
     @checked
     def rim(cls, cloud: PointCloud, table: Plane | float, share: Fraction = 0.2) -> "Region":
-        """Return the space above a level near the top of an object.
+        """Return the region above a level near the top of an object.
 
         The level is lower than the cloud's highest point by `share` of that point's height over the
-        table. The space has no upper end.
+        table. The region has no upper end.
 
         Args:
             cloud: the cloud of the object.

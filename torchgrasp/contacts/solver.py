@@ -94,8 +94,8 @@ class LinearConstraints(Linearisation):
     """The linearised constraints of contact sets, a in number.
 
     `residual` holds r constraints times their `weight` (no unit; `Constraints` gives the units of
-    the values). `jacobian` holds the derivatives of the constraints, without weights, by the u
-    unknowns.
+    the values). `jacobian` holds the derivatives of the constraints, without weights, with respect
+    to the u unknowns.
     """
 
     residual: Float[Tensor, "a r"]
@@ -105,7 +105,7 @@ class LinearConstraints(Linearisation):
 
     @property
     def weighted_jacobian(self) -> Float[Tensor, "a r u"]:
-        """The Jacobian of the r weighted residuals by the u unknowns."""
+        """The Jacobian of the r weighted residuals with respect to the u unknowns."""
         return self.weight[..., None] * self.jacobian
 
 

@@ -155,15 +155,15 @@ class GraspController:
     def status(self) -> Status:
         """Whether the hand can hold the object: `OK`, or `TOO_HEAVY`.
 
-        `TOO_HEAVY` means that the mode "grip" senses more load than the hand can hold. The hand
+        `TOO_HEAVY` means that the mode "grip" measures more load than the hand can hold. The hand
         should then set the object down. In other modes the status is always `OK`.
         """
         return self.hold.status if isinstance(self.hold, GripHold) else Status.OK
 
     @property
     def friction(self) -> Distribution | None:
-        """What is known of the coefficient of friction: that of the plan, within bounds that the
-        touches show.
+        """The coefficient of friction as far as it is known: that of the plan, within bounds from
+        the touches.
 
         A fingertip that sticks bounds the coefficient below; one that slides bounds it above. If
         the plan's coefficients are all out of bounds, the bounds alone count. None unless the hand
@@ -176,7 +176,7 @@ class GraspController:
 
     @property
     def mass(self) -> Distribution | None:
-        """The `Distribution` of the object's mass [kg] that the felt load shows.
+        """The `Distribution` of the object's mass [kg], from the load that the fingertips measure.
 
         None unless the hand holds in the mode "grip" and its load is steady. If the object is too
         heavy for the hand (`status`), the distribution begins at the mass that was carried. It ends
@@ -199,7 +199,7 @@ class GraspController:
 
     @property
     def displacement(self) -> Float[Tensor, "4 4"]:
-        """The displacement (4, 4) [m] of the object that the touches show.
+        """The displacement (4, 4) [m] of the object, as estimated from the touches.
 
         A rigid transform in the frame of the planned hand, from the planned to the present object.
         It is the identity before any touch, and if the pose is not estimated

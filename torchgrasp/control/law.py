@@ -187,7 +187,7 @@ def joint_step(
     which coupled fingers lack. No joint changes by more than `MAX_STEP`.
 
     Args:
-        jacobian: Jacobian [m/rad] of the f fingertips by the h actuated joints.
+        jacobian: Jacobian [m/rad] of the f fingertips with respect to the h actuated joints.
         velocity: commanded velocity of each fingertip.
         period: period of the tick [s].
         posture_error: planned minus present joints [rad]. The motions that leave the fingertips at

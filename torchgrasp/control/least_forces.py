@@ -151,7 +151,7 @@ class LeastForces:
         Args:
             contacts: the grasp map.
             normals: outward unit normals of the contacts.
-            jacobian: Jacobian [m/rad] of the fingertips by all joints.
+            jacobian: Jacobian [m/rad] of the fingertips with respect to all joints.
             load: wrench [N, N m] that the forces exert on the object, about the contacts' centroid.
             friction: coefficient of friction.
             floor: least normal force [N] of each finger.

@@ -105,7 +105,7 @@ class GraspTry:
     The robot goes through these steps:
 
     1. Move the hand to `obj_from_hand`, and call `controller.step` until `controller.closed`.
-    2. Lift the hand. Still call `controller.step`, then `fails`, at each tick.
+    2. Lift the hand. Go on calling `controller.step`, then `fails`, at each tick.
     3. If the lift fails, lower the hand, send the targets of `withdraw`, and go on with `next`.
 
     Args:
@@ -198,9 +198,9 @@ class GraspTry:
         """Return an iterable of the `Targets` of each tick in which the lowered hand opens and
         withdraws.
 
-        The hand withdraws as `Targets.left` grows from 0 to `length`, then waits as long. The
-        attribute `speed` [m/s] of the result is the rate of this growth at the last target that was
-        drawn.
+        The hand withdraws as `Targets.left` grows from 0 to `length`, then waits for the same time.
+        The attribute `speed` [m/s] of the result is the rate of this growth at the last target that
+        was drawn.
 
         Args:
             observation: the last observation, which shows where the fingers begin.
@@ -215,7 +215,7 @@ class GraspTry:
         """Return the next try, at the object where it is now expected; None if no grasp is left.
 
         Its grasp is the one of `others` that most likely holds, given that the tried grasps failed.
-        Without a `surface` it is simply the first of `others`. So it is for grasps that were
+        Without a `surface` it is simply the first of `others`. The same holds for grasps that were
         planned without a table or not ranked by success.
 
         The `grasps` of the next try have in `meta` what this try has shown, as texts of a

@@ -45,7 +45,7 @@ ALONG_STD = 3.0
 def feel_flags(tactile: TactileState, touching: Bool[Tensor, "f"]) -> TactileState:
     """Return the tactile state of f fingertips that sense only whether they touch.
 
-    The `reading` of a fingertip that touches is 0.3 N (`WAITING_FORCE`), that of another one 0.
+    The `reading` of a fingertip that touches is 0.3 N (`WAITING_FORCE`), that of any other one 0.
     Contact points and normals are NaN.
 
     Args:
@@ -193,8 +193,8 @@ class FingertipSensor:
 
         Args:
             truth: true contacts of the f fingertips, averaged over the tick.
-            jacobian: Jacobian (f, 3, j) [m/rad] of the fingertips by all j joints of the URDF
-                (`Observation.jacobian`).
+            jacobian: Jacobian (f, 3, j) [m/rad] of the fingertips with respect to all j joints of
+                the URDF (`Observation.jacobian`).
             period: length [s] of the tick.
         """
         reference = self.reference

@@ -263,8 +263,8 @@ class Observation(Value):
     Args:
         joints: positions (j,) [rad or m] of all joints, in the order of `hand.tree.joint_names`.
         tips: centres (f, 3) [m] of the fingertips.
-        jacobian: Jacobian (f, 3, j) [m/rad] of these centres by all joints. Each joint counts
-            alone, without the joints that are coupled to it.
+        jacobian: Jacobian (f, 3, j) [m/rad] of these centres with respect to all joints. Each
+            column is for one joint alone, without the joints that are coupled to it.
         tactile: readings of the fingertips.
     """
 
@@ -301,8 +301,10 @@ def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> O
 def joint_jacobian(
     hand: Hand, joints: Float[Tensor, " j"], points: Float[Tensor, "f 3"]
 ) -> Float[Tensor, "f 3 j"]:
-    """Return the Jacobian [m/rad] of `points` [m] on the fingertips by all joints of the URDF, as
-    if none were coupled.
+    """Return the Jacobian [m/rad] of points on the fingertips with respect to all joints of the
+    URDF.
+
+    The joints count as if none were coupled. `points` [m] are points on the fingertips.
 
     `joints` [rad] are the positions of all joints, and the points are in the frame of the root
     link.

@@ -136,8 +136,8 @@ def write_objects(
     """Make a folder of objects from a folder of mesh files; return the names of the objects.
 
     Each object is named after its file, without the suffix. Each mesh is translated. Its lowest
-    point is then at z = 0, and the centre of its bounding box above the origin. Each view is a
-    noisy cloud of at most 1000 points, rendered from a random direction above (`partial_view`). The
+    point is then at z = 0, and the centre of its bounding box on the z axis. Each view is a noisy
+    cloud of at most 1000 points, rendered from a random direction above (`partial_view`). The
     manifest, `manifest.json`, names all objects and views. It is written last, so a folder with a
     manifest is complete.
 

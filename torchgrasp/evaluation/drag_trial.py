@@ -70,10 +70,10 @@ class DragResult(Value):
             `DROPPED`: the object toppled, or hangs or fell over the edge.
             `SLIPPED`: the object is more than 20 mm (`DRAGS.slipped`) from its planned place.
             `START_OVERLAP` and `UNSTABLE`: as in `close_hand`.
-        motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform; NaN if
-            the drag is `UNSTABLE`.
-        missed: distance [m] of the object's centre of mass from where the plan wanted it; NaN in
-            the same case.
+        motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform. NaN if
+            the status is `UNSTABLE`.
+        missed: distance [m] of the object's centre of mass from its planned place. NaN if the
+            status is `UNSTABLE`.
         forces: sum (t,) [N] of the true normal forces of the fingertips at each control tick.
     """
 
@@ -151,8 +151,8 @@ class EdgeLift(NamedTuple):
 
     Attributes:
         drag: record of the drag; None if the plan has none.
-        tries: the tries of the lift (`lift_grasps`). Empty if the drag failed. It is empty, too, if
-            most contacts of the grasps are not on the object that the drag left.
+        tries: the tries of the lift (`lift_grasps`). Empty if the drag failed, or if most contacts
+            of the grasps are off the object after the drag.
     """
 
     drag: DragResult | None

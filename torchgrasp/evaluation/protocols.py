@@ -69,8 +69,8 @@ class PullSpec(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
-    """The settings of the simulated trials that test a grasp. Trials are pulls at a floating
-    object, or a lift off a table.
+    """The settings of the simulated trials that test a grasp: pulls at a floating object, or a lift
+    off a table.
 
     `PROTOCOLS` holds ready protocols by name, such as "tabletop" and "dexgraspbench".
 
@@ -89,9 +89,10 @@ class Protocol(Value):
         tries: largest number of grasps of a view to try, one after the other, in one lift
             (`lift_grasps`).
 
-    Raises `BadArgument` for two contradictions. The first is a `noise.rotation` with an object
-    displaced during the approach. The second is `pull` with a setting of lifts: `criterion`,
-    `displaced`, `push`, `relook` or `tries`.
+    Raises `BadArgument` for:
+
+    * a `noise.rotation` with an object displaced during the approach;
+    * `pull` with a setting of lifts: `criterion`, `displaced`, `push`, `relook` or `tries`.
     """
 
     name: str

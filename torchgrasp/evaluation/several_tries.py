@@ -52,8 +52,8 @@ class LiftTry(NamedTuple):
 def lift_grasps(
     trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3
 ) -> tuple[LiftTry, ...]:
-    """Lift an object with the first of several grasps, and with further ones while lifts fail;
-    return all tries.
+    """Lift an object with the first of several grasps; after a failed lift, try the next one.
+    Return all tries.
 
     The robot may feel that the object slides or stays behind (`LiftCheck`), or that it is too
     heavy. Then the hand goes down, opens and withdraws; the object stays where it is. The robot

@@ -60,12 +60,13 @@ class ProtocolResult(Value):
             "ejected", "shape off", or "never met". Or it is "too weak", "dropped when pushed",
             "turned" or "slid". It is "" if the object was held, if the simulation diverged, or in
             pulls.
-        size: size of the cause. It is an angle [deg] for "toppled" and "turned", and a force [N]
-            for "too weak" and "dropped when pushed". For others it is a distance [mm].
+        size: number that goes with the `cause`. It is an angle [deg] for "toppled" and "turned",
+            and a force [N] for "too weak" and "dropped when pushed". For other causes it is a
+            distance [mm].
         gap_mm: largest gap [mm] between a fingertip and the object at the planned posture. It is
             measured before any force and without a pose error.
         deepest_mm: smallest such gap [mm]; negative if the fingertip penetrates the object.
-        touch: whether the fingertips then touch (`Touch.verdicts`); "" if unknown.
+        touch: verdict on these gaps, such as "touches" (`Touch.verdicts`); "" if unknown.
     """
 
     rank: int
@@ -168,10 +169,10 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     * "touch": number of each verdict on these gaps (`measure_touch`).
     * "success": how well predicted success fits the outcomes, or None without predictions.
       "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for
-      perfect predictions, and 0 for always the mean. "auc" is the area under the ROC curve. Both
-      are NaN if all trials passed, or none. "error" is the expected calibration error over the
-      "bins". A bin holds the predictions from `low` to `high`. Its `predicted` is their mean, and
-      `passed` the `Share` of their trials that passed.
+      perfect predictions, and 0 for a constant prediction, the mean. "auc" is the area under the
+      ROC curve. "skill" and "auc" are NaN if all trials passed, or none. "error" is the expected
+      calibration error over the "bins". A bin holds the predictions from `low` to `high`. Its
+      `predicted` is their mean, and `passed` the `Share` of their trials that passed.
 
     >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
     >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)

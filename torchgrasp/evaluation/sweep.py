@@ -59,10 +59,10 @@ def evaluate(
         folder: folder in which the executable grasps of each view are saved, as
             OBJECT/VIEW.safetensors. None means a temporary folder. No other run may write to it at
             the same time.
-        workers: number of worker processes. 0 means this process, without time limits. Apart from
-            CPU times and tasks that are ended at a limit, the scores do not depend on it. Such
-            tasks have the status `TIMED_OUT`, which `summarise` counts. The limit is of CPU time,
-            on which the load of the machine has little influence, but its speed has.
+        workers: number of worker processes. 0 means this process, without time limits. The scores
+            do not depend on it, with two exceptions. CPU times vary, and a task that reaches a
+            limit of CPU time ends with the status `TIMED_OUT`. The number of such tasks, which
+            `summarise` counts, depends on the speed of the machine.
 
     Raises:
         BadArgument: the protocol is unknown.

@@ -61,7 +61,7 @@ def plan_motion(
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
 
     Raises `BadArgument` for grasps that were planned without this arm or with it at another place.
-    Raises it also for joints of another hand.
+    It is also raised for joints of another hand.
 
     >>> grasps = plan_grasps(cloud, hand, spec, arm=arm)  # doctest: +SKIP
     >>> motion = plan_motion(arm, hand, grasps[:1])  # doctest: +SKIP

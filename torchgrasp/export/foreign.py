@@ -79,8 +79,8 @@ Quaternion = Literal["wxyz", "xyzw"]
 
 
 class ForeignGrasps(NamedTuple):
-    """The g grasps of another program's file, for a hand with h actuated joints; `read_foreign`
-    returns it.
+    """The g grasps in another program's file, for a hand with h actuated joints; `read_foreign`
+    returns them.
 
     Attributes:
         joints: positions (g, h) [rad or m] of the actuated joints, in the order of
@@ -126,16 +126,16 @@ def read_foreign(
 
     Coupled and parked joints of the file may differ from the hand's, unless a fingertip moves by
     over 0.1 mm. A `GraspFileWarning` names values that are not kept, and joints that bend backward.
-    It tells, too, if an `isaac_grasp` file names no hand in its first line or the gripper's path.
+    It also tells if an `isaac_grasp` file names no hand in its first line or in the gripper's path.
 
     Args:
         path: the file. Its angles are in radians.
         hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are
             known.
-        order: names (as in the hand's URDF) of the numbers in a posture of the file, in their
-            order. `JOINT:FACTOR` or `JOINT:FACTOR:OFFSET` convert a number of another sign, unit or
-            zero [rad]. Numbers under names that the hand does not have are not read. () serves
-            files that name their joints, and the Allegro hand's files of DexGraspBench.
+        order: the joint, by its name in the hand's URDF, of each number in a posture of the file.
+            `JOINT:FACTOR` or `JOINT:FACTOR:OFFSET` converts a number of another sign, unit or zero
+            position [rad]. Numbers under names that the hand does not have are not read. () is for
+            files that name their joints, and for the Allegro hand's files of DexGraspBench.
         quaternion: order of the four numbers after the position in a pose, "wxyz" or "xyzw". Files
             that name their numbers need none.
         unit_m: length [m] of one unit of the positions in the file.
@@ -498,12 +498,12 @@ def grasps_from_joints(
 ) -> Grasps:
     """Return imported joints and poses as `Grasps`, for `certify`, `close_hand` and the exporters.
 
-    No object is known. So each contact is in the middle of a fingertip's pad, and its normal is
+    Since no object is known, each contact is the contact point of a fingertip's pad. Its normal is
     opposite to the pad's normal. Certificates are for these contacts. A grasp without frictional
     form closure gets `Status.NOT_CLOSED`. Replace contacts and certificate if you know the surface.
 
-    `clearance` is only that between links, and the success is unknown (NaN). `approach` is the
-    hand's approach axis.
+    `clearance` is that between links alone, and the predicted success is unknown (NaN). `approach`
+    is the hand's approach axis.
 
     Args:
         hand: the hand.

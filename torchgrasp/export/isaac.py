@@ -81,7 +81,7 @@ def format_isaac(
         grasps: grasps planned for this hand, best first.
         force: normal force [N] of the strongest finger when the fingers press.
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
-        rename: the robot's names of joints, by their names in the URDF; None keeps all names.
+        rename: dict from a joint's name in the URDF to the robot's name; None keeps all names.
         flange: pose (4, 4) [m] of the robot's flange in the frame of the hand's root link. With it,
             the gripper's frame is the flange. None means the frame of `gripper_link`.
         object_id: name of the object's frame, such as its path in the stage.

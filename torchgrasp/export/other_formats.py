@@ -189,7 +189,7 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
 
 @checked
 def largest_std(surface: Surface) -> float:
-    """Return the standard deviation [m] at the upper end of the colours of `save_surface`.
+    """Return the standard deviation [m] at the upper end of the colour scale of `save_surface`.
 
     It is the 99 % quantile over the vertices of the surface, at least 1e-6 m.
 

@@ -62,7 +62,7 @@ def format_grasps(
         grasps: grasps planned for this hand, best first.
         force: normal force [N] of the strongest finger at the squeeze.
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
-        rename: the robot's names of joints, by their names in the URDF; None keeps all names.
+        rename: dict from a joint's name in the URDF to the robot's name; None keeps all names.
         flange: pose (4, 4) [m] of the robot's flange in the frame of the hand's root link. With it,
             the flange's pose is added as "flange". None adds nothing.
 
@@ -221,9 +221,9 @@ def quaternion(a_from_b: Tensor | np.ndarray) -> list[float]:
 def format_keyframes(
     hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None
 ) -> str:
-    """Return the hand as MJCF text (of MuJoCo) with four keyframes for each grasp.
+    """Return the hand as MJCF, MuJoCo's model format, with four keyframes for each grasp.
 
-    Those of the first grasp are `grasp_0_approach`, `grasp_0_pregrasp`, `grasp_0_grasp` and
+    The keyframes of the first grasp are `grasp_0_approach`, `grasp_0_pregrasp`, `grasp_0_grasp` and
     `grasp_0_squeeze`. At the approach the opened hand is 0.1 m before its pre-grasp. The squeeze
     has the joints of the grasp, and targets with which the fingers press.
 

@@ -78,10 +78,10 @@ def format_moveit(
         grasps: grasps planned for this hand, best first.
         force: normal force [N] of the strongest finger when the fingers press.
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
-        rename: the robot's names of joints, by their names in the URDF. These joints come first, in
-            this order. None keeps all names.
+        rename: dict from a joint's name in the URDF to the robot's name. These joints come first,
+            in this order. None keeps all names.
         flange: pose (4, 4) [m] of the robot's flange in the frame of the hand's root link. With it,
-            poses are the flange's. None means poses of the root link.
+            `grasp_pose` is the pose of the flange. None means that of the root link.
         object_id: id of the object in the planning scene, which the hand may touch.
         actuated: whether to leave out efforts and coupled joints, which follow others. Controllers
             of ros2_control refuse both.
@@ -137,10 +137,11 @@ def format_trajectories(
     rename: Mapping[str, str] | None = None,
     actuated: bool = False,
 ) -> str:
-    """Return a text with a YAML document of trajectory_msgs/JointTrajectory for each grasp.
+    """Return the trajectories of the hand's joints as text, one YAML document for each grasp.
 
-    Each trajectory of the hand's joints has three points: pre-grasp, grasp, and squeeze, where
-    targets press. `time_from_start` is in seconds. The hand must already be at its pose, which
+    Each document is a ROS message trajectory_msgs/JointTrajectory. It has three points: pre-grasp,
+    grasp and squeeze, the targets with which the fingers press. Positions are in [rad], or [m] for
+    sliding joints. `time_from_start` is in seconds. The hand must already be at its pose, which
     `format_moveit` and `format_grasps` give. The points have no efforts, which position controllers
     refuse; `format_grasps` has the torques.
 
@@ -149,8 +150,8 @@ def format_trajectories(
         grasps: grasps planned for this hand, best first.
         force: normal force [N] of the strongest finger at the squeeze.
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
-        rename: the robot's names of joints, by their names in the URDF. These joints come first, in
-            this order. None keeps all names.
+        rename: dict from a joint's name in the URDF to the robot's name. These joints come first,
+            in this order. None keeps all names.
         actuated: whether to leave out coupled joints, which follow others. Controllers of
             ros2_control refuse their names.
 
@@ -172,10 +173,10 @@ def format_trajectories(
 
 @checked
 def format_motion(hand: Hand, motion: ArmMotion, actuated: bool = False) -> str:
-    """Return a text with a YAML document of trajectory_msgs/JointTrajectory for each grasp, of arm
-    and hand.
+    """Return the trajectories of arm and hand as text, one YAML document for each grasp.
 
-    Positions are in [rad], or [m] for sliding joints; `time_from_start` is in seconds.
+    Each document is a ROS message trajectory_msgs/JointTrajectory. Positions are in [rad], or [m]
+    for sliding joints. `time_from_start` is in seconds.
 
     Args:
         hand: the hand on the arm.

@@ -260,8 +260,8 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
 
 
 def _refuse_gradients(name: str, value: Any) -> None:
-    """Raise `BadArgument` if derivatives are taken by a tensor of a value whose fields are not
-    checked.
+    """Raise `BadArgument` if derivatives are taken with respect to a tensor of a value whose fields
+    are not checked.
     """
     for field, x in vars(value).items():
         if isinstance(x, Tensor):

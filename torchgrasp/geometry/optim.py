@@ -133,7 +133,7 @@ Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
 
 @dataclasses.dataclass(frozen=True)
 class LinearResiduals(Linearisation):
-    """The m residuals of each problem of a batch at its state, and their Jacobian by its d
+    """The m residuals of each problem of a batch at its state, with their Jacobian by its d
     variables.
     """
 

@@ -97,9 +97,9 @@ class DistanceField(Value, abc.ABC):
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """Return (distance, gradient) at points (*b, 3) [m], interpolated between the nodes.
 
-        `distance` (*b,) is the signed distance [m], and `gradient` (*b, 3) its derivative by the
-        point (no unit). Here b stands for any batch axes. Outside the grid, the distance [m] from
-        the grid is added to the value at the border.
+        `distance` (*b,) is the signed distance [m], and `gradient` (*b, 3) its derivative with
+        respect to the point (no unit). Here b stands for any batch axes. Outside the grid, the
+        distance [m] from the grid is added to the value at the border.
         """
         origin, spacing, last, (dx, dy), first, corners = self._grid(points)
         position = (points - origin) / spacing
@@ -134,12 +134,12 @@ class SignedDistanceField(DistanceField):
     """Signed distances [m] of one object at the nodes of a regular grid, negative inside the
     object.
 
-    `surface_field` makes it of an estimated shape. The grid is along the axes of the object's
+    `surface_field` makes it from an estimated shape. The grid is along the axes of the object's
     frame. `query` returns distance and gradient at any points, interpolated between the nodes.
 
     Args:
         origin: position (3,) [m] of node (0, 0, 0).
-        spacing: distance [m] of neighbouring nodes.
+        spacing: distance [m] between neighbouring nodes.
         values: signed distances (x, y, z) [m]; `values[i, j, k]` is at the point `origin` + (i, j,
             k) * `spacing`.
 
@@ -166,7 +166,8 @@ class SignedDistanceField(DistanceField):
     def rows(self, index: Int[Tensor, "k"]) -> "SignedDistanceField":
         """Return this field unchanged, whatever the `index` (k,).
 
-        Other distance fields hold one object for each entry of a batch, and return some of them.
+        It holds one object for the whole batch. Other distance fields hold one object for each
+        entry, and return those of the entries `index`.
         """
         return self
 
@@ -174,7 +175,12 @@ class SignedDistanceField(DistanceField):
     def query(
         self, points: Float[Tensor, "*b 3"]
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Return (distance, gradient) at points (*b, 3) [m], as `DistanceField.query`."""
+        """Return (distance, gradient) at points (*b, 3) [m], interpolated between the nodes.
+
+        `distance` (*b,) is the signed distance [m], negative inside the object. `gradient` (*b, 3)
+        is its derivative with respect to the point (no unit). b stands for any batch axes. Outside
+        the grid, the distance [m] from the grid is added to the value at the border.
+        """
         if not is_fused(points, self.values, self.origin):
             return super().query(points)
         from torchgrasp.geometry import fused_grid  # it imports numba

@@ -44,11 +44,11 @@ class FingerAbility:
         name: name of the finger.
         tip_link: name of the link of its tip.
         joints: number of the actuated joints that move the tip.
-        force: greatest normal force [N] of the tip, the median over the free postures. NaN if in
-            half of them no joint moves the contact point along its normal. Then the structure
-            carries the load.
-        sure_force: normal force [N] that the tip reaches in 90 % of the free postures. NaN if in
-            these no joint moves the contact point along its normal.
+        force: greatest normal force [N] of the tip, as the median over the free postures. NaN if in
+            half of them no joint moves the contact point along its normal. The load is then carried
+            by the links, not by the motors.
+        sure_force: normal force [N] that the tip reaches in 90 % of the free postures. NaN if no
+            joint moves the contact point along its normal in these postures.
 
     Both forces act at the contact point of the pad, along the pad's normal. No other finger
     presses, and each actuated joint exerts at most its effort. A posture is free if no links of the
@@ -130,9 +130,9 @@ class HandAbilities:
     def content(self) -> dict[str, Any]:
         """Return the abilities as a dict for JSON.
 
-        It holds all fields, with a dict for each finger and each pair. Spans and widths are lists
-        of the least and the greatest. Keys of numbers with a unit end with it, as `force_n`; those
-        of shares end with "_share". Numbers have six significant digits. NaN becomes None.
+        It holds all fields, with a dict for each finger and each pair of fingers. A span or a width
+        is a list [least, greatest]. A key ends with the unit of its number, as in "force_n" [N] and
+        "span_m" [m], or with "_share". Numbers have six significant digits. NaN becomes None.
         """
         fingers = [
             {
@@ -172,8 +172,8 @@ def hand_abilities(hand: Hand, postures: Count = 5000, seed: Seed = 0) -> HandAb
 
     Args:
         hand: the hand, with its grasping fingers. The result is cached in `hand.derived`.
-        postures: number of random postures, uniform within the joint limits. With more postures,
-            the least and greatest values come nearer to those of the hand.
+        postures: number of random postures, uniform within the joint limits. More postures bring
+            the least and greatest values nearer to the hand's true limits.
         seed: seed of the random postures.
 
     Raises `BadArgument` if links of the hand overlap in every drawn posture.

@@ -79,8 +79,8 @@ class ActuatedJoints(Value):
     def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
         """Return the positions (*b, j) [rad or m] of all j movable joints of the URDF.
 
-        Unlike `expand`, it does not check for NaN and infinity. On a GPU this check would wait for
-        the numbers.
+        Unlike `expand`, it does not check for NaN and infinity. On a GPU this check would have to
+        wait for the values.
 
         Args:
             joints: positions (*b, h) [rad or m] of the h actuated joints.
@@ -93,7 +93,7 @@ class ActuatedJoints(Value):
     def check(self, joints: Tensor, name: str = "joints") -> None:
         """Raise `BadArgument` unless `joints` are finite positions of the h actuated joints.
 
-        A wrong count, dtype or device is refused, too. Limits are not checked.
+        Count, dtype and device are also checked. Limits are not.
 
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.
@@ -111,7 +111,8 @@ class ActuatedJoints(Value):
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
         """Raise `BadArgument` unless all `joints` are within their limits.
 
-        A limit may be exceeded by the rounding of float32. What `check` refuses is refused, too.
+        A limit may be exceeded by the rounding of float32. Raises `BadArgument` for all that
+        `check` refuses, as well.
 
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.
@@ -239,10 +240,10 @@ class Fingertips(Value):
 
     @checked(gradients=True)
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Frames, Float[Tensor, "3 4 f n"]]:
-        """Return the poses [m] of the m links of `chains`, then those of the f carriers, in n
-        postures.
+        """Return (links, carriers): the poses [m] of the m links of `chains`, and of the f
+        carriers, in n postures.
 
-        The shapes are (3, 4, m, n) and (3, 4, f, n), without the last rows of the 4 x 4 matrices.
+        The shapes are (3, 4, m, n) and (3, 4, f, n): the last row of each 4 x 4 matrix is left out.
         The poses are in the palm's frame.
 
         Args:

@@ -305,7 +305,8 @@ class Hand(Value):
     def jacobian(
         self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
     ) -> Float[Tensor, "*b f 3 h"]:
-        """Return the Jacobian (*b, f, 3, h) of a point on each fingertip by the actuated joints.
+        """Return the Jacobian (*b, f, 3, h) of a point on each fingertip with respect to the
+        actuated joints.
 
         It is in the palm's frame. Its unit is [m/rad]; columns of sliding joints have none.
 

@@ -63,10 +63,10 @@ class SelfCollision(Value):
             sphere-box pairs, then sphere-sphere pairs.
         kinds: numbers of box-box, sphere-box and sphere-sphere pairs.
 
-    In the methods, `frames` (3, 4, l, n) are the poses [m] of the l links in n postures, which
-    `Hand.tree.frames` returns. A negative separation is minus the shortest translation that
-    separates two shapes. A positive separation is a lower bound of their distance, exact where a
-    face is nearest.
+    In the methods, `frames` (3, 4, l, n) are the poses [m] of the l links in n postures. All are in
+    one frame. `Hand.tree.frames` returns them. A negative separation is minus the shortest
+    translation that separates two shapes. A positive separation is a lower bound of their distance,
+    exact where a face is nearest.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -86,16 +86,17 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def clearance(self, frames: Frames, below: Bound = torch.inf) -> Float[Tensor, " n"]:
-        """Return the least signed separation (n,) [m] of all pairs in each posture.
+        """Return the least signed separation (n,) [m] over all pairs of shapes, in each of n
+        postures.
 
-        It is infinite if there are no pairs.
+        A negative value means overlap. The result is infinite if there are no pairs.
 
         Args:
-            frames: poses (3, 4, l, n) [m] of the links.
+            frames: poses (3, 4, l, n) [m] of the l links, from `Hand.tree.frames`.
             below: separation [m] up to which results are needed. Where the least separation is
                 greater, the result is any number of at least `below`, or infinity.
 
-        Raises `BadArgument` for too few links.
+        Raises `BadArgument` if `frames` has too few links.
         """
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
@@ -118,14 +119,18 @@ class SelfCollision(Value):
 
     @checked
     def separations(self, frames: Frames, below: Bound) -> Float[Tensor, "p n"]:
-        """Return the signed separation (p, n) [m] of each pair in each posture.
+        """Return the signed separation (p, n) [m] of each of p pairs of shapes, in each of n
+        postures.
+
+        A negative value means overlap: it is minus the shortest translation that separates the
+        shapes. A positive value is a lower bound of the distance.
 
         Args:
-            frames: poses (3, 4, l, n) [m] of the links.
+            frames: poses (3, 4, l, n) [m] of the l links, from `Hand.tree.frames`.
             below: separation [m] up to which results are needed. Pairs whose bounding spheres are
                 farther apart get the separation of these spheres, a lower bound.
 
-        Raises `BadArgument` for too few links, and inside `torch.vmap`.
+        Raises `BadArgument` if `frames` has too few links, and inside `torch.vmap`.
         """
         shapes, apart, chosen = self._near(frames, below)
         return apart.index_put(chosen[:2], self._separations(shapes, chosen))
@@ -134,22 +139,24 @@ class SelfCollision(Value):
     def pushes(
         self, frames: Frames, below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
-        """Return (separations, index, wrenches): how far the pairs are apart, and how this changes
-        with motion.
+        """Return (separations, index, wrenches): how far the p pairs of shapes are apart, and how
+        motion changes this.
 
-        * `separations` (p, n) [m] are those of the method `separations`.
-        * `index` (p, n) is the column in `wrenches` of each pair in each posture.
-        * `wrenches` (6, k) are derivatives of a separation by a twist of the pair's second shape.
-          Three are by its translation, then three [m/rad] by its rotation about the origin. Axes
-          and origin are those of the frame of `frames`.
+        * `separations` (p, n) [m] are those of the method `separations`, in n postures.
+        * `index` (p, n) is the column in `wrenches` of each pair in each posture. Pairs may share
+          one.
+        * `wrenches` (6, k) has k columns. A column is the derivative of a separation with respect
+          to a motion of the pair's second shape. Rows 0 to 2 are for its translation (no unit).
+          Rows 3 to 5 [m/rad] are for its rotation about the origin. Axes and origin are those of
+          the frame of `frames`.
 
         The wrench of a pair that is at least `below` apart is zero.
 
         Args:
-            frames: poses (3, 4, l, n) [m] of the links.
+            frames: poses (3, 4, l, n) [m] of the l links, from `Hand.tree.frames`.
             below: separation [m] up to which pairs have a wrench.
 
-        Raises `BadArgument` for too few links, and inside `torch.vmap`.
+        Raises `BadArgument` if `frames` has too few links, and inside `torch.vmap`.
         """
         shapes, apart, (pair, row, parts) = self._near(frames, below)
         separation = apart.new_zeros(len(pair))
@@ -172,14 +179,14 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def count_near(self, frames: Frames, below: Bound) -> int:
-        """Return the number of pairs whose bounding spheres are nearer than `below` [m], over all
-        postures.
+        """Return the number of pairs of shapes whose bounding spheres are nearer than `below` [m],
+        summed over n postures.
 
         Args:
-            frames: poses (3, 4, l, n) [m] of the links.
+            frames: poses (3, 4, l, n) [m] of the l links, from `Hand.tree.frames`.
             below: separation [m] of bounding spheres.
 
-        Raises `BadArgument` for too few links, and inside `torch.vmap`.
+        Raises `BadArgument` if `frames` has too few links, and inside `torch.vmap`.
         """
         return len(self._near(frames, below)[2].pair)
 

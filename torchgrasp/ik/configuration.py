@@ -60,12 +60,13 @@ class Configuration(Batch):
 
 
 class ResidualRows(NamedTuple):
-    """k residuals of g configurations, with the factors of their derivatives by q motions.
+    """k residuals of g configurations, with the factors of their derivatives with respect to q
+    motions.
 
     `residual` is a weighted length [mm], or a weighted error of a cosine. `wrench` holds its
-    derivatives by a translation [m] and by a rotation [rad] about the object's origin. The
-    derivative by a motion is `wrench` times the twist of the motion where `moves` is 1. It is 0
-    where `moves` is 0.
+    derivatives with respect to a translation [m] and a rotation [rad] about the object's origin.
+    The derivative with respect to a motion is `wrench` times the twist of the motion where `moves`
+    is 1. It is 0 where `moves` is 0.
     """
 
     residual: Float[Tensor, "g k"]

@@ -115,7 +115,8 @@ class DragPlan(Value):
     Everything is in the frame of the cloud. f counts fingertips, and h actuated joints.
 
     Attributes:
-        joints: actuated joints (h,) [rad or m] of the pressing hand; they stay the same.
+        joints: positions (h,) [rad or m] of the actuated joints of the pressing hand. They stay the
+            same during the drag.
         obj_from_hand: pose (4, 4) [m] of the hand's root link where the tips touch the object.
         presses: mask (f,) of the fingers that press.
         feet: points (f, 3) [m] where the tips touch; NaN for fingers that do not press.

@@ -63,8 +63,8 @@ def with_drag(grasps: Grasps, drag: DragPlan) -> Grasps:
 def drag_of(grasps: Grasps) -> DragPlan | None:
     """Return the drag that comes before grasps at the edge of a table; None if there is none.
 
-    `with_drag` gives grasps a drag, as `torchgrasp grasp --edge` does. Numbers are in float64.
-    Raises `BadArgument` for a drag that no planner wrote.
+    The drag is stored in `Grasps.meta`, as by `plan_edge_grasps` and `torchgrasp grasp --edge`.
+    Numbers are in float64. Raises `BadArgument` for a malformed drag.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> drag_of(load_shipped_grasp("jug", "allegro")) is None

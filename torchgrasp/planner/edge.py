@@ -46,9 +46,9 @@ class EdgePlan(Value):
             They are in the frame of the cloud, the best first, as those of `plan_grasps`. Their
             metadata hold the drag (`torchgrasp.planner.drag_of`), so that one file has both.
         shape: the estimated shape after the drag, in the same frame.
-        reason: why there is no drag; empty if there is one. The object hangs over the edge far
-            enough, or is too heavy. Or no posture of the hand can press on it, or a neighbour is
-            in its way. Or the edge is too far for what the camera saw of a scene.
+        reason: why there is no drag, as a sentence; "" if there is one. The object may hang over
+            the edge far enough, or be too heavy. No posture of the hand may press on it. A
+            neighbour may be in its way. The edge may be too far outside what the camera saw.
     """
 
     drag: DragPlan | None
@@ -58,10 +58,10 @@ class EdgePlan(Value):
 
     @property
     def success(self) -> float:
-        """The predicted success of the first grasp, in [0, 1], times that of the drag.
+        """The predicted success of the first grasp, in [0, 1], times the success rate of drags.
 
-        The latter is the share of simulated drags that ended as planned (`DRAG.ended`). The result
-        is 0 without an executable grasp, and NaN if its success is unknown.
+        The rate is the share of simulated drags that ended as planned (`DRAG.ended`). The result is
+        0 without an executable grasp, and NaN if its success is unknown.
         """
         good = self.grasps[self.grasps.status == Status.OK]
         if not len(good):
@@ -84,26 +84,26 @@ def plan_edge_grasps(
 ) -> EdgePlan:
     """Plan to drag the object to the edge of its table, and grasps there; return both.
 
-    The grasps resist half as much weight again (`DRAG.carried`), as with the argument `resist` of
-    `plan_grasps`.
+    The grasps resist 1.5 times the object's weight (`DRAG.carried`), as with the argument `resist`
+    of `plan_grasps`.
 
     Args:
         cloud: points that a camera saw [m], as for `plan_grasps`.
         hand: the hand, or its name or folder.
-        spec: constraints. Its `table` must be a plane with an `edge` (`Plane.ending`). Its region
-            is where the object lies before the drag, and moves with it. The drag counts on the tenth
-            quantile of its friction (`DRAG.sure`), if that is a distribution.
+        spec: constraints. Its `table` must be a plane with an `edge` (`Plane.ending`). Its `region`
+            is given for the object before the drag, and moves with the object. If its `friction` is
+            a distribution, the drag is planned with the 10 % quantile (`DRAG.sure`).
         starts: number of random initial guesses of the contact planner.
         seed: random seed.
-        task: what grasps must do; None means `GraspTask()`. The greatest mass of a distribution is
-            dragged.
+        task: what grasps must do; None means `GraspTask()`. If its mass is a distribution, the drag
+            is planned for the greatest mass.
         table_friction: coefficient of friction between object and table. The pressing force is
             three times (`DRAG.reserve`) the least one that moves the object (Coulomb's law).
 
     Raises:
         BadArgument: a table without an edge; or an edge more than 15 mm (`DRAG.behind`) behind the
-            object's estimated centre of mass. There the object would fall. Also one whose edge is
-            more than 2 m (`DRAG.farthest`) from all points: its numbers are not metres.
+            object's estimated centre of mass. There the object would fall. Also an edge more than 2
+            m (`DRAG.farthest`) from all points, whose numbers are then not metres.
         BadArgument: a friction of the fingertips that is not greater than `table_friction`.
 
     >>> import torch

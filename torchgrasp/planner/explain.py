@@ -186,23 +186,23 @@ class Trial(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Explanation(Value):
-    """Why there is no executable grasp: where planning lost them, and which single change would
-    help.
+    """Why planning found no executable grasp: which stage lost the candidates, and which single
+    change would help.
 
     `explain_empty` returns it. `print(explanation)` shows one line for each planning stage, and the
     `advice`.
 
     Attributes:
-        starts: number of initial guesses from which grasps were planned, without a change and with
-            each.
+        starts: number of initial guesses of each plan, the plan without a change and those with
+            one.
         funnel: how many candidates each planning stage lost, and why, without a change. Its field
-            `stages` holds "contacts", "postures" and "grasps", in this order. Each has its
-            name `stage`, and the numbers `given` and `kept` of its `things`. The dict `lost` has
-            the number lost for each `Status`.
+            `stages` has an entry for "contacts", "postures" and "grasps", in this order. An entry
+            has the name `stage`, the word `things` for its candidates, and their numbers `given`
+            and `kept`. The dict `lost` has the number lost for each `Status`.
         trials: the result of planning with each change, the most helpful first. Its `words`
             describe the change, and `choice` is whether the user can make it. `executable` is the
-            number of grasps, `expected` their mean predicted success as in `best`, and `funnel` the
-            losses.
+            number of executable grasps. `expected` is the mean predicted success, in [0, 1], of the
+            best of them. `funnel` has the losses.
         left: number of further changes that were not tried, to bound the work.
 
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
@@ -231,10 +231,10 @@ class Explanation(Value):
     def advice(self) -> str:
         """A sentence for the user on what would help most.
 
-        It names the most helpful change. If the user cannot make it, such as a higher friction, the
-        sentence names one more. It is the most helpful one that the user can make. If no change
-        helps, it names the stage that loses most and the reason. If there is a grasp after all, it
-        says so.
+        It names the most helpful change. The user may be unable to make this change, such as a
+        higher friction. Then the sentence also names the most helpful change that the user can
+        make. If no change helps, the sentence names the stage that loses most candidates, and the
+        reason. If there is a grasp after all, it says so.
         """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
@@ -281,13 +281,17 @@ def explain_empty(
     """Return why `plan_grasps` found no executable grasp, and which single change would give
     grasps.
 
-    Each change is tried by planning with it. The changes are: no `keep`, `avoid` or `resist`; other
-    fingers; another shipped hand; wider limits of contacts; higher friction. Further changes are no
-    table or another one, no neighbours, or neighbours that may be pushed. Another is an arm that
-    reaches every pose.
+    Each change is tried by planning with it. The changes are:
 
-    The search ends at a change that the user can make and that gives grasps which are likely to
-    succeed. If a grasp is found without a change, no change is tried.
+    * no `keep`, `avoid` or `resist`;
+    * other fingers, or another shipped hand;
+    * wider limits of contacts, or a higher friction;
+    * no table, or another one;
+    * no neighbours, or neighbours that may be pushed;
+    * an arm that reaches every pose.
+
+    The search ends at a change that the user can make and that gives grasps with a high predicted
+    success. If a grasp is found without a change, no change is tried.
 
     The work is bounded by numbers (`EXPLAIN`), not by time, so a seed always gives the same
     explanation:
@@ -296,7 +300,7 @@ def explain_empty(
     * Relaxed constraints are tried only if no contact set is found.
     * At most 8 changes are tried, fewer with "auto" fingers. First come those that could prevent
       the most losses.
-    * If no change helps, a request of at most 80 guesses is tried with four times as many.
+    * If no change helps and `starts` is at most 80, four times as many guesses are tried.
 
     Args:
         cloud: the cloud or scene, as in `plan_grasps`.
@@ -307,9 +311,9 @@ def explain_empty(
         fingers, task, promise, reachable, arm, keep, avoid, resist, mode, ranking, shape: as in
             `plan_grasps`.
         time_budget: wall time [s] after which no change is begun; None means no limit.
-        observer: function that is called with a name, a line of text and a value. The name is
-            "funnel", with the losses of the first plan, then "change", with the result of each
-            change.
+        observer: function that is called with a name, a line of text and a value. First the name is
+            "funnel", and the value holds the losses of the plan without a change. Then the name is
+            "change", and the value is the result of each change.
 
     Raises the errors of `plan_grasps`.
 

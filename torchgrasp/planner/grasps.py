@@ -113,7 +113,7 @@ def plan_grasps(
             are on a GPU, it plans them at once, and the processes only estimate the shapes.
         fingers: the fingers that grasp, as in `load_hand`; None means the fingers of `hand`. "auto"
             tries the sets of fingers in the hand's file, and takes the most likely to succeed.
-            `hand_of` loads the hand of the result.
+            `torchgrasp.hand.hand_of` loads the hand of the result.
         task: what grasps must do; success is predicted for it. None means `GraspTask()`.
         promise: share of the executable grasps that must hold, in [0.5, 0.99]. Less sure grasps get
             the status `NO_PROMISE`. `meta["promise"]` says how many trials support the promise
@@ -149,7 +149,7 @@ def plan_grasps(
         BadArgument: an argument of the wrong type or range; a bad file of cloud or hand.
         BadArgument: an object of no graspable size; no target; a camera that cannot have seen it.
         BadArgument: a table above most points or a camera, or over 2 m below the top; `keep` off
-            the object; an `arm` of another hand; a `promise` for a displaced object.
+            the object; an `arm` of another hand; a `promise` with `GraspTask.displaced`.
         BadArgument: `shape`, `arm`, `observer`, `reachable` or a region beside several clouds.
         MissingExtra, NoWorkers: pebble or numba is not installed, or no worker process can start.
 
@@ -224,7 +224,7 @@ def stream_grasps(
         mode, ranking, time_budget, shape, observer: as in `plan_grasps`.
 
     Raises the errors of `plan_grasps`. Errors of arguments and files are raised at the call. Errors
-    of what the points show, such as a wrong size, are raised at the first iteration.
+    that depend on the points, such as a wrong size, are raised at the first iteration.
 
     >>> from torchgrasp import load_hand, load_object
     >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=12))

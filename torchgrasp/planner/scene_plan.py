@@ -68,9 +68,9 @@ class ScenePlan(Value):
     Attributes:
         things: one plan for each object; objects without a grasp come last.
         clear: labels of objects to take away, in this order, so that the `target` of `plan_scene`
-            has a grasp. It is empty without a target, if the target has a grasp, or if its
-            `ThingPlan.status` rules one out. It is also empty if up to three objects do not
-            suffice.
+            has a grasp. It is empty without a target, if the target has a grasp, or or if its
+            `ThingPlan.status` rules one out. It is also empty if taking away up to three objects
+            does not suffice.
 
     >>> empty = ThingPlan(1, success=0.0, reason="too flat")
     >>> ScenePlan((empty,)).best is None
@@ -82,8 +82,9 @@ class ScenePlan(Value):
 
     @property
     def best(self) -> ThingPlan | None:
-        """The plan of the object to grasp first, that of the greatest success; None if no object
-        has a grasp.
+        """The `ThingPlan` of the object to grasp first; None if no object has a grasp.
+
+        It is the object whose best grasp has the greatest predicted success.
         """
         return next((thing for thing in self.things if thing.grasps is not None), None)
 
@@ -117,7 +118,7 @@ def plan_scene(
     image border, or too large for a prediction of success, are planned last.
 
     With a `target`, only this object is planned. If it has no grasp, it is planned again without
-    the nearest objects. `ScenePlan.clear` then says which of them to take away.
+    the nearest objects. `ScenePlan.clear` then lists the ones to take away.
 
     Args:
         scene: objects on a table, or a file of `save_scene`.
@@ -129,7 +130,7 @@ def plan_scene(
         enough: predicted success in [0, 1]. Once a grasp has it, the remaining objects are not
             planned.
         fingers: the fingers that grasp, as in `plan_grasps`. "auto" chooses for each object, and
-            `hand_of` loads the hand of its grasps.
+            `torchgrasp.hand.hand_of` loads the hand of its grasps.
         task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
 
     Raises:

@@ -131,11 +131,11 @@ class FitProgress(Value):
 
     Attributes:
         components: the Gaussians, in standardised dimensions.
-        reseeded: number of times (m,) that each Gaussian collapsed and got a new place. The
+        reseeded: number of times (m,) that each Gaussian collapsed and was placed anew. The
             likelihood may fall after that.
         log_likelihood: mean log-likelihood (t,) [nats] of the standardised data before each step.
-        jumped: whether the likelihood may fall. It may if a Gaussian got a new place in the last
-            step. It also may if the next step uses another subset of the samples.
+        jumped: whether the likelihood may fall in the next step. It may if a Gaussian was placed
+            anew in the last step, or if the next step uses another subset.
         rows: number of samples that the last step used; 0 before the first step.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])

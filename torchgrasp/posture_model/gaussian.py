@@ -57,8 +57,9 @@ class GaussianMixture(Value):
 
     Args:
         weights: probabilities (m,) of the components, of sum 1.
-        means: means (m, d) of the components, in the units of the d dimensions.
-        covariances: covariances (m, d, d) of the components, in products of these units.
+        means: means (m, d) of the components, each entry in the unit of its dimension.
+        covariances: covariances (m, d, d) of the components, each entry in the product of the units
+            of its two dimensions.
         names: names of the d dimensions.
 
     Raises `BadArgument` for inconsistent shapes, a repeated name, or a covariance that is not
@@ -107,12 +108,13 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
-        """Return the log-density (*b,) [nats] at each point, Eq. (19).
+        """Return the log-density (*b,) [nats] of the mixture at each point, Eq. (19).
 
         Args:
-            x: points (*b, d), in the units of the dimensions. b stands for any batch axes.
+            x: points (*b, d), each coordinate in the unit of its dimension. b stands for any batch
+                axes.
 
-        Raises `BadArgument` for points of another length.
+        Raises `BadArgument` for points that do not have d coordinates.
         """
         if x.ndim < 1 or x.shape[-1] != len(self.names):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
@@ -126,7 +128,7 @@ class GaussianMixture(Value):
         It is -inf for a component of weight 0. The log-sum-exp over the m components is `log_prob`.
 
         Args:
-            x: points (n, d), in the units of the dimensions.
+            x: n points (n, d), each coordinate in the unit of its dimension.
         """
         density = self.whitening.log_scale - 0.5 * self.whitening.squared(x.double())
         weights = self.weights.double()
@@ -137,7 +139,8 @@ class GaussianMixture(Value):
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:
-        """Draw n random points (n, d) of the mixture, in the units of its dimensions, in float64.
+        """Draw n random points (n, d) of the mixture in float64, each coordinate in the unit of its
+        dimension.
 
         The same `seed` gives the same points. Samples are not differentiable.
 
@@ -208,12 +211,13 @@ class GaussianMixture(Value):
         return GaussianMixture(weights, means, covariances, names)
 
     def mean(self) -> Float[Tensor, "d"]:
-        """Return the mean (d,) of the whole mixture, in the units of the dimensions."""
+        """Return the mean (d,) of the whole mixture, each entry in the unit of its dimension."""
         return self.weights.double() @ self.means.double()
 
     def covariance(self) -> Float[Tensor, "d d"]:
-        """Return the covariance matrix (d, d) of the whole mixture, in products of the dimensions'
-        units.
+        """Return the covariance matrix (d, d) of the whole mixture.
+
+        The unit of an entry is the product of the units of its two dimensions.
         """
         offset = self.means.double() - self.mean()
         within = torch.einsum("m,mij->ij", self.weights.double(), self.covariances.double())

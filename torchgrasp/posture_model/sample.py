@@ -141,13 +141,15 @@ class HandSamples(Batch):
 class SampleSpec(Value):
     """The settings by which `write_samples` draws `n` postures without self-collision.
 
-    With the same seed and sampling, a smaller number of postures is the beginning of a larger one.
+    With equal seed and sampling, fewer postures are the first ones of a longer sequence.
 
     Args:
         n: number of postures, 1 to 100,000,000.
         seed: seed of the draws.
-        sampling: which postures are taken. "uniform" means all, as in the paper. "grasping" means
-            those in which contacts at random places on the pads can have force closure.
+        sampling: which postures are kept.
+            "uniform": all without self-collision, as in the paper.
+            "grasping": of these, only postures in which contacts at random places on the pads can
+              have force closure.
 
     Raises `BadArgument` for values out of range.
 
@@ -179,17 +181,17 @@ def sample_configurations(
 ) -> HandSamples:
     """Return `n` random postures within the joint limits and without self-collision (Sec. 6.3).
 
-    With the same `seed` and `sampling`, a smaller number of postures is the beginning of a larger
-    one.
+    With equal `seed` and `sampling`, fewer postures are the first ones of a longer sequence.
 
     Args:
         hand: the hand.
         n: number of postures, 1 to 100,000,000.
         seed: seed of the draws.
         workers: number of threads that draw at the same time, 1 to 1024.
-        sampling: which postures are taken. "uniform" means all without self-collision. "grasping"
-            means those in which contacts at random places on the pads can have force closure. It
-            needs a hand with three fingers.
+        sampling: which postures are kept.
+            "uniform": all without self-collision.
+            "grasping": of these, only postures in which contacts at random places on the pads can
+              have force closure. It needs a hand with three fingers.
         observer: function that is called after each chunk of up to 10,000 postures with their
             number.
 

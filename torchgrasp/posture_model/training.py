@@ -159,7 +159,8 @@ def fit_mixture(
         components: number m of Gaussians.
         seed: seed of k-means, and of the random subsets.
         iterations: largest number of EM steps.
-        tolerance: the fit stops when a step raises the mean log-likelihood by less [nats].
+        tolerance: least rise [nats] of the mean log-likelihood in a step; the fit stops at a
+            smaller one.
         regularisation: variance added to every dimension of a component, relative to the
             dimension's variance over all samples.
         starts: number of k-means initialisations, with consecutive seeds. After a short fit from
@@ -168,7 +169,7 @@ def fit_mixture(
             subset after the other, and all samples at last. The `starts` are compared on small
             subsets. None means that EM uses all samples in each step.
         checkpoint: file that stores the fit after every step; None means none. If it exists, the
-            fit continues from it, with the same bits as without a break.
+            fit continues from it. The result is bitwise that of an uninterrupted fit.
         distributed: whether this is one of several processes under torchrun, and `samples` are only
             its part. All processes must see the same checkpoint.
         observer: function that is called with the state of the fit after each step.

@@ -39,14 +39,14 @@ def read_scene(path: Path | str) -> Scene:
     * `given`: labels that a user made, as in `Scene.given`. The pixels of other labels then stay as
       they are. If it is missing, the user made all labels, or none in a file with `table` and
       `labels`.
-    * `bounded`: False for an image made of a cloud, whose border is not that of the camera's view.
-      If it is missing, it is True.
+    * `bounded`: False for an image rendered from a cloud, whose border is not that of the camera's
+      view. If it is missing, it is True.
 
     Other arrays are not read; `Scene.notes` names them.
 
     Raises `CloudFileError` for no such file, or for malformed content. Raises `BadArgument` for a
-    `target` that is no label of an object, or a normal not of length 1. Raises the errors of
-    `Scene.from_depth`, too.
+    `target` that is no label of an object, or a normal not of length 1. Also raises the errors of
+    `Scene.from_depth`.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene
@@ -99,8 +99,8 @@ def _with_found(scene: Scene, labels: Int[Tensor, "h w"], given: np.ndarray) -> 
 def save_scene(scene: Scene, path: Path | str) -> Path:
     """Write a scene as .npz, atomically, for `read_scene`. Return the path.
 
-    The file holds the arrays that `read_scene` lists. It does not hold `notes`, and of several
-    points in one pixel only the nearest.
+    The file holds the arrays that `read_scene` lists. It does not hold `notes`. Of several points
+    in one pixel, it holds only the nearest.
 
     Raises `BadArgument` for a path that does not end in .npz, and `OutputError` if the file cannot
     be written.

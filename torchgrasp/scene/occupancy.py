@@ -71,13 +71,13 @@ class Occupancy(Value):
     """The probability that something else occupies each voxel around a target, from
     `estimate_occupancy`.
 
-    Something else is neither the target nor the table. The grid has x by y by z voxels.
+    "Something else" means neither the target nor the table. The grid has x by y by z voxels.
 
     Attributes:
         origin: centre (3,) [m] of voxel (0, 0, 0), in the frame of the scene that
             `estimate_occupancy` was given. Its z axis must point up (`Scene.to_upright`).
-        spacing: distance [m] of neighbouring centres. Voxel (i, j, k) has its centre at `origin` +
-            (i, j, k) * `spacing`.
+        spacing: distance [m] between neighbouring centres. Voxel (i, j, k) has its centre at
+            `origin` + (i, j, k) * `spacing`.
         probability: probability (x, y, z) of each voxel, in [0, 1].
 
     >>> free = Occupancy(torch.zeros(3), 0.01, torch.zeros(2, 3, 4))
@@ -258,15 +258,14 @@ def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]
 def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     """Return the probability that something else occupies each voxel around the target.
 
-    Something else is neither the target nor the table. Space in front of a measured depth is free.
-    Behind another object, a fitted model estimates the probability. Behind the target and where
-    nothing was measured, it is a rough guess.
+    "Something else" means neither the target nor the table. Space in front of a measured depth is
+    free. Behind another object, a fitted model estimates the probability. Behind the target and
+    where nothing was measured, it is a rough guess.
 
-    The voxels have a side of 5 mm (`OCCUPANCY.spacing`), and extend 0.25 m
-    (`OCCUPANCY.sideways`) around the target. They reach from the table up to 0.04 m
-    (`OCCUPANCY.above`) above the objects. This is above the highest measured point of an object in
-    this area. Without a table they begin at the lowest one. The probabilities are float64 on the
-    scene's device, but computed on the CPU.
+    The voxels have a side of 5 mm (`OCCUPANCY.spacing`), and extend 0.25 m (`OCCUPANCY.sideways`)
+    around the target. They reach from the table to 0.04 m (`OCCUPANCY.above`) above the highest
+    measured point of an object in this area. Without a table they begin at the lowest such point.
+    The probabilities are float64 on the scene's device, but computed on the CPU.
 
     Args:
         scene: the scene in a frame with z up, as `Scene.to_upright` returns it. Its table, if it

@@ -105,7 +105,7 @@ class Scene(Value):
             else.
         image: the camera's depth image. Its fields are `depth` (h, w) [m], 0 where nothing was
             measured, `intrinsics` (3, 3) [pixels] and `obj_from_camera` (4, 4) [m]. Its field
-            `bounded` is False if it was made of a cloud, and so has no true border.
+            `bounded` is False if the image was rendered from a cloud, and so has no true border.
         pixels: row and column (n, 2) of each point in the image.
         table: the plane that the objects stand on, or None if it is unknown.
         target: label of the object to be grasped, or None if none is chosen.
@@ -344,7 +344,7 @@ class Scene(Value):
         For a pixel or a point, the target is the object of the nearest measured point.
 
         Raises `BadArgument` if that point is on no object, or farther than 3 pixels (`SCENE.click`)
-        or 10 mm (`SCENE.touch`). Raises it for a label that is not in `things`, too.
+        or 10 mm (`SCENE.touch`). It is also raised for a label that is not in `things`.
         """
         if isinstance(target, int) and not isinstance(target, bool):
             if target not in self.things:
@@ -389,10 +389,10 @@ class Scene(Value):
         * Two objects touch, so that the border between them is a guess; not if both are `given`.
         * An object that is not `given` has a crease: it may be several objects.
         * The target is not `given`, and has a jump in depth, or is long with gaps in its outline.
-          It may be several objects, too.
+          It may also be several objects.
         * The target is cut off at the border of the image.
         * Another object hides much of the target.
-        * The target has `doubts`, so that its success is unknown.
+        * The target has `doubts`, so the predicted success is unknown.
         """
         found = [
             f"objects could also stand on another plane ({plane.describe()}); "
@@ -414,10 +414,11 @@ class Scene(Value):
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Why the target may be several objects, or a part of one, a sentence each. They are those
-        of `advice` on creases, on jumps and gaps, and on objects that touch the target.
+        """Reasons why the target may be several objects, or a part of one, a sentence each.
 
-        Empty without a target. Empty for a target that is `given`, too: its outline is no guess.
+        They are the sentences of `advice` on creases, on jumps and gaps, and on objects that touch
+        the target. There are none without a target, or for a target that is `given`: its outline is
+        no guess.
         """
         # the search for guesses goes over the whole image
         if self.target is None or self.target in self.given:
@@ -473,10 +474,11 @@ class Scene(Value):
 
     @property
     def covers(self) -> dict[int, float]:
-        """The objects that hide much of the target, by label. The number is the share of its
-        outline before which each stands.
+        """The objects that hide much of the target: a dict from each object's label to a share in
+        [0, 1].
 
-        Only shares above a fifth (`SCENE.covered`) are listed. Without a target there are none.
+        The share is the part of the target's outline that this object stands in front of. Only
+        shares above a fifth (`SCENE.covered`) are listed. Without a target the dict is empty.
         """
         labels = self.pixel_labels.cpu()
         depth = self.image.depth.cpu().double()
@@ -496,8 +498,9 @@ class Scene(Value):
 
     @property
     def pixel_labels(self) -> Int[Tensor, "h w"]:
-        """Label (h, w) of each pixel of the image, as in `labels`; also 0 where nothing was
-        measured.
+        """The label (h, w) of each pixel of the image: 1, 2, ... for the objects, 0 elsewhere.
+
+        It is 0 on the table, and where no depth was measured.
         """
         height, width = self.image.depth.shape
         row, column = self.pixels.long().unbind(-1)

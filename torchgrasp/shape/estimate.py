@@ -161,13 +161,14 @@ def off_surface(
 class MeanJet(Batch):
     """The mean signed distance at points with its gradient and Hessian, from `ShapeGP.mean_jet`.
 
-    Derivatives are by normalised coordinates. Gradients need not have unit length. b stands for the
-    batch axes of the points.
+    All lengths are normalised: one unit is `ShapeGP.scale` [m]. Derivatives are with respect to
+    normalised coordinates. Gradients need not have unit length. b stands for the batch axes of the
+    points.
 
     Attributes:
         distance: mean signed distance (*b,), normalised.
         gradient: gradient (*b, 3) of the mean (no unit).
-        hessian: second derivatives (*b, 3, 3) of the mean, per normalised unit.
+        hessian: second derivatives (*b, 3, 3) of the mean [1 / normalised unit].
     """
 
     distance: Float[Tensor, "*b"]
@@ -176,15 +177,18 @@ class MeanJet(Batch):
 
     @property
     def normals(self) -> Float[Tensor, "*b 3"]:
-        """The outward unit normals, Eq. (11) of the paper."""
+        """The outward unit normals (*b, 3): the gradient divided by its length, Eq. (11) of the
+        paper.
+        """
         return unit(self.gradient)
 
     @property
     def normal_jacobian(self) -> Float[Tensor, "*b 3 3"]:
-        """The derivatives of the unit normals by the points, per normalised unit: (1 - n n^T) H /
-        |g|.
+        """The Jacobian (*b, 3, 3) of the unit normals with respect to the points [1 / normalised
+        unit].
 
-        Here n is the normal, H the Hessian and g the gradient.
+        It is (1 - n n^T) H / |g|, with the normal n, the Hessian H and the gradient g. Entry (i, j)
+        is the derivative of normal_i with respect to point_j.
         """
         n = self.normals
         steep = norm(self.gradient)[..., None, None]
@@ -196,14 +200,15 @@ class MeanJet(Batch):
 class SurfaceJet(MeanJet):
     """The mean signed distance with two derivatives, and its variance with one, from `ShapeGP.jet`.
 
-    Derivatives are by normalised coordinates. b stands for the batch axes of the points.
+    All lengths are normalised: one unit is `ShapeGP.scale` [m]. Derivatives are with respect to
+    normalised coordinates. b stands for the batch axes of the points.
 
     Attributes:
         distance: mean signed distance (*b,), normalised.
         gradient: gradient (*b, 3) of the mean (no unit).
-        hessian: second derivatives (*b, 3, 3) of the mean, per normalised unit.
+        hessian: second derivatives (*b, 3, 3) of the mean [1 / normalised unit].
         variance: variance (*b,) of the signed distance, in squared normalised units.
-        variance_gradient: gradient (*b, 3) of the variance, in normalised units.
+        variance_gradient: gradient (*b, 3) of the variance [normalised units].
 
     >>> from torchgrasp import fit_shape, load_object
     >>> shape = fit_shape(load_object("jug").view)
@@ -219,8 +224,8 @@ class SurfaceJet(MeanJet):
 class JointEstimate(Value):
     """The joint posterior of signed distance d and gradient w at k points, from `ShapeGP.joint`.
 
-    Distances are normalised: one unit is `ShapeGP.scale` [m]. The gradient w is by normalised
-    coordinates (no unit), and need not have unit length.
+    Distances are normalised: one unit is `ShapeGP.scale` [m]. The gradient w is with respect to
+    normalised coordinates (no unit). It need not have unit length.
 
     Attributes:
         mean: means (k, 4) of (d, w) at each point.
@@ -234,7 +239,8 @@ class JointEstimate(Value):
 
 @dataclasses.dataclass(frozen=True)
 class ShapeDerivatives(Value):
-    """Derivatives of a `ShapeEstimate` by the query points [m], from `ShapeGP.differentiate`.
+    """Derivatives of a `ShapeEstimate` with respect to the query points [m], from
+    `ShapeGP.differentiate`.
 
     b stands for the batch axes of the query points. One normalised unit is `ShapeGP.scale` [m].
 

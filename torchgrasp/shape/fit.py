@@ -103,18 +103,18 @@ def fit_shape(
             unit is the shape's `scale` [m], about the object's radius. If `support` is "paper",
             also that of a component of a normal.
         budget: number of observed points, 25 to 1000 (`SHAPE.budget`). Up to 20 of them lie on a
-            sphere around the object. One lies in its centre if that is inside. The others are the
-            most informative points of the cloud. The outline and the hidden side come in addition.
-            None means 85 for "camera" (`SHAPE.camera`) and 70 for "paper" (`SHAPE.paper`). "sure",
-            the paper's rule, adds points until no point's variance (squared normalised units)
-            exceeds `noise`, but at most 1000.
+            sphere around the object. One lies at its centre, if the centre is inside. The others
+            are the most informative points of the cloud. The outline and the hidden side come in
+            addition. None means 85 for "camera" (`SHAPE.camera`) and 70 for "paper"
+            (`SHAPE.paper`). "sure", the paper's rule, adds points until no point's variance
+            (squared normalised units) exceeds `noise`, but at most 1000.
         psi_scale: ratio of the kernel's length psi to the longest distance between observed points,
             1 to 100. Below 1.34 the covariance may be indefinite.
         support: "camera" or "paper", as above.
         seed: seed of the random draws.
         table: the table's plane, or its height [m] along z; None means no table. Only "camera"
-            keeps the shape out of it. One farther below the points than they extend changes
-            nothing, of which `NoEffect` warns.
+            keeps the shape out of it. A table farther below the points than they extend has no
+            effect, and `NoEffect` warns.
         kernel: "thin_plate", "matern52" or "rbf", whose length follows from psi; or your own
             `Kernel` of normalised distances.
         criterion: the most informative point has the greatest "variance" of its distance, or the
@@ -283,9 +283,9 @@ def condition(
     """Return the shape as a Gaussian process posterior, given normalised observations, Eqs. (7)-(9)
     of the paper.
 
-    The result is differentiable, to any order, in the observations and in the frame's centre. It is
-    so, too, in tensors of the kernel's profile. The length psi of a kernel by name and the domain's
-    radius are constants.
+    The result is differentiable, to any order, in the observations, the frame's centre and tensors
+    of the kernel's profile. The domain's radius is a constant, and so is the length psi of a named
+    kernel.
 
     Args:
         observations: signed distances and normals at n points, with their noise, all normalised.
@@ -294,7 +294,7 @@ def condition(
         cloud: the points [m] that the camera saw, in the frame of `normalisation.center`. The
             result holds them; the posterior does not depend on them.
         psi_scale: ratio of the kernel's length psi to the longest distance between observed points.
-            The paper's value 1 makes the covariance of a thin plate indefinite.
+            The paper's value 1 makes the covariance of the thin plate kernel indefinite.
         std_factor: factor of `std_m` in results of `ShapeGP.predict`: the ratio of the surface's
             true deviations to the posterior's standard deviations.
         kernel: "thin_plate", "matern52" or "rbf", whose length follows from psi; or your own

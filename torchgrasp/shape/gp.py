@@ -79,13 +79,15 @@ class ShapeGP(Posterior, Normalisation):
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations,
             calibrated on known objects. `std_m` of `predict` includes this factor.
         cloud: the points [m] that the camera saw, after cleaning.
-        kind: how the hidden side was completed. It is that of a "ball", of a body of "revolution",
-            of a "mirrored" body, or of an open "vessel". "guess" means from the outline alone, or
-            not at all. "cut off" means that the image border cuts the object off, and "whole" that
-            there is no hidden side.
+        kind: how the hidden side was completed:
+            "ball", "revolution", "mirrored", "vessel": as that of a ball, a body of revolution, a
+              mirror-symmetric body, or an open vessel.
+            "guess": from the outline alone, or not at all.
+            "cut off": the image border cuts the object off.
+            "whole": there is no hidden side.
 
-    Results at given points are differentiable in the points to any order, and those of `sample`
-    twice. At observed points they are twice differentiable, and normals of a thin plate once.
+    Results are differentiable in the query points to any order, those of `sample` twice. At
+    observed points they are twice differentiable, and normals of the thin plate kernel once.
     `update` refuses points that require a gradient.
 
     >>> from torchgrasp import fit_shape, load_object
@@ -115,7 +117,7 @@ class ShapeGP(Posterior, Normalisation):
     ) -> "ShapeGP":
         """Return the shape with the observations of `posterior`, whose normalised frame is `frame`.
 
-        Nothing is transformed or computed anew; `condition` makes a shape of observations. The
+        Nothing is transformed or computed anew; `condition` makes a shape from observations. The
         domain's radius is the smaller of two lengths. One is half the kernel's `diameter`. The
         other is 1.25 (`DOMAIN.reach`) times the greatest distance of an observed point from the
         centre. The shape's `kind` is "guess".
@@ -227,10 +229,11 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
-        """Return the derivatives of the results of `predict` by points (*b, 3) [m] in the cloud's
-        frame.
+        """Return the derivatives of the results of `predict` with respect to the points (*b, 3)
+        [m].
 
-        The derivatives are per metre, with the dtype of `points`. b stands for any batch axes.
+        The points are in the cloud's frame. The derivatives are per metre, with the dtype of
+        `points`. b stands for any batch axes.
 
         Raises `BadArgument` for numbers that are not finite, and for points outside the domain,
         where `predict` gives a guess.
@@ -327,7 +330,7 @@ class ShapeGP(Posterior, Normalisation):
             normal_noise: standard deviation of the components of a unit normal (no unit).
 
         Raises `BadArgument` for a wrong argument, a normal of length 0, or a point outside the
-        domain. A view that contradicts `cloud` raises it, too, as in `merge_clouds`.
+        domain. It is also raised for a view that contradicts `cloud`, as in `merge_clouds`.
 
         >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
         >>> from torchgrasp import fit_shape

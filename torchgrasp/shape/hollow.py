@@ -52,8 +52,8 @@ class HollowShape(ShapeGP):
     """The shape of an open vessel: the material between an outer and an inner surface.
 
     `fit_shape` returns it for an upright open vessel seen from above on a `table`. It has all
-    methods of `ShapeGP`. Each surface is a Gaussian process, and both share one normalised frame.
-    One smooth field cannot change its sign twice within a thin wall.
+    methods of `ShapeGP`. Each surface is a Gaussian process of its own. The reason is that one
+    smooth field cannot change its sign twice within a thin wall. Both share one normalised frame.
 
     At each point one surface applies: the surface with the greater mean signed distance. Distance,
     normal and covariance are those of this surface. The errors of the two surfaces are independent.
@@ -125,7 +125,7 @@ class HollowShape(ShapeGP):
         """Return (distance, gradient): the mean signed distance (q,) and its gradient (q, 3).
 
         They are at q points `x` (q, 3) that `normalise` returned. The distance is normalised: one
-        unit is `scale` [m]. The gradient is by normalised coordinates (no unit).
+        unit is `scale` [m]. The gradient is with respect to normalised coordinates (no unit).
         """
         a, slope_a = self.outer.mean_and_gradient(x)
         b, slope_b = self.inner.mean_and_gradient(x)

@@ -158,7 +158,7 @@ def distance_rows(
     Args:
         d: the three components (q, n) of the differences from the n observed points.
         k: the kernel's values at their lengths.
-        first: the kernel's first derivative k' by r^2 / 2 there.
+        first: the kernel's first derivative k' with respect to r^2 / 2 there.
         near: number of the observed points with normals, which come first.
     """
     slope = first[:, :near]

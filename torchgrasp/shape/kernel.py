@@ -68,18 +68,19 @@ class Formula(partial[Any]):
 @dataclasses.dataclass(frozen=True)
 class Kernel:
     """A radial kernel: the covariance k(r) of the signed distances at two points a normalised
-    distance r apart.
+    distance r apart. One normalised unit is `ShapeGP.scale` [m].
 
     Use `thin_plate_kernel`, `matern52_kernel` or `rbf_kernel`, or your own profile. `fit_shape` and
-    `condition` take a kernel. With `condition`, gradients also reach tensors that the profile
-    itself uses, such as a length.
+    `condition` take a kernel. With `condition`, gradients also flow to tensors that the profile
+    uses, such as a length scale.
 
     Args:
         profile: the function k(r), elementwise on a tensor of distances r >= 0. It must be smooth
             for r > 0, with k'(0) = 0.
-        diameter: diameter, normalised, of the ball in which k is positive definite; infinite if it
-            is so everywhere.
-        remedy: fix that the error suggests if the covariance is not positive definite.
+        diameter: diameter, normalised, of the ball in which k is positive definite; infinite if k
+            is positive definite everywhere.
+        remedy: advice in the text of the error that is raised if the covariance is not positive
+            definite.
         closed_form: function of `r` and `count` that returns the results of `derivatives` faster
             than autograd of the profile. False means autograd. Where a gradient is needed, autograd
             is used in any case.
@@ -100,15 +101,15 @@ class Kernel:
         r: Float[Tensor, "*s"],
         count: Orders,
     ) -> tuple[Float[Tensor, "*s"], ...]:
-        """Return the first `count` of the tensors k(r), k1(r), k2(r), k3(r): the derivatives of k
-        by r^2 / 2.
+        """Return the first `count` of k(r), k1(r), k2(r), k3(r): k and its derivatives with respect
+        to r^2 / 2.
 
         These are k1 = k' / r, k2 = k1' / r and k3 = k2' / r, where ' is d/dr. They are not the
-        derivatives by r. The results are differentiable. At r = 0 infinite values count as 0, and
-        k3 is not reliable.
+        derivatives with respect to r. The results are differentiable. At r = 0 infinite values
+        count as 0, and k3 is not reliable.
 
         Args:
-            r: normalised distances of any shape (*s,), which each result has, too.
+            r: normalised distances (*s,) of any shape. Each result has the same shape.
             count: number of results, 1 to 4.
 
         Raises `BadArgument` for a `count` out of range.
@@ -135,7 +136,8 @@ def differentiate(
     u: Float[Tensor, "*s"],
     count: int,
 ) -> tuple[Float[Tensor, "*s"], ...]:
-    """Return the first `count` (1 to 4) of k and its derivatives by u = r^2 / 2, by autograd.
+    """Return the first `count` (1 to 4) of k and its derivatives with respect to u = r^2 / 2, by
+    autograd.
 
     They are differentiable by u to any order, but at r = 0 only those up to (d/du)^2 k are right.
     Higher ones, and infinite ones, count as 0 there. Covariances and their second derivatives
@@ -204,6 +206,8 @@ def thin_plate(
 def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
     """Return the thin plate kernel k(r) = 2 r^3 - 3 psi r^2 + psi^3, Eq. (6) of the paper.
 
+    r is the distance of two points. Lengths are normalised: one unit is `ShapeGP.scale` [m].
+
     Args:
         psi: the kernel's length, normalised. k is positive definite only in a ball of diameter
             3/4 `psi`.
@@ -254,8 +258,11 @@ def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     """Return the Matern 5/2 kernel k(r) = variance (1 + s + s^2 / 3) exp(-s), with s = sqrt(5) r /
     length.
 
-    `length` is a normalised distance. `variance` is the prior variance of the signed distance, in
-    squared normalised units.
+    r is the distance of two points. Lengths are normalised: one unit is `ShapeGP.scale` [m].
+
+    Args:
+        length: length scale, normalised.
+        variance: prior variance of the signed distance, in squared normalised units.
 
     Raises `BadArgument` for a length or variance that is not positive.
 
@@ -289,8 +296,11 @@ def _differentiate_matern52(
 def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     """Return the squared exponential kernel k(r) = variance exp(-r^2 / (2 length^2)).
 
-    `length` is a normalised distance. `variance` is the prior variance of the signed distance, in
-    squared normalised units.
+    r is the distance of two points. Lengths are normalised: one unit is `ShapeGP.scale` [m].
+
+    Args:
+        length: length scale, normalised.
+        variance: prior variance of the signed distance, in squared normalised units.
 
     Raises `BadArgument` for a length or variance that is not positive.
 

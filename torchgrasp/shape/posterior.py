@@ -128,7 +128,7 @@ class Posterior(Value):
         """Return (distance, gradient): the mean signed distance (q,) and its gradient (q, 3).
 
         They are at q points `x` (q, 3) that `normalise` returned. The distance is normalised: one
-        unit is `scale` [m]. The gradient is by normalised coordinates (no unit).
+        unit is `scale` [m]. The gradient is with respect to normalised coordinates (no unit).
         """
         if not self._is_plain(x):
             distance, *slope = (self.cross(x) @ self.weights).unbind(0)

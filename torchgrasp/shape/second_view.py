@@ -76,7 +76,7 @@ class NextView(Value):
         turn: angle [deg], seen from the object, between this camera and the nearest earlier one;
             NaN if no earlier camera is known.
         before: mean standard deviation [m] of the surface now.
-        after: mean standard deviation [m] of the surface that is expected with the second view.
+        after: mean standard deviation [m] of the surface that is expected after the second view.
     """
 
     camera_pose: Pose
@@ -127,9 +127,9 @@ def next_view(
             table of the grasps, if they have one. Without a table, cameras may be below the object.
         distance: distance [m] of the camera from the middle of the surface, at least 1.5 radii
             (`VIEW.near`) of the shape's domain. None means the mean distance of earlier cameras, or
-            0.5 m (`VIEW.far`) if none is known. It is at least the least distance.
+            0.5 m (`VIEW.far`) if none is known. If that is less than 1.5 radii, it means 1.5 radii.
 
-    Raises `BadArgument` for a distance below the least one, and for grasps whose contacts all lie
+    Raises `BadArgument` for a `distance` below 1.5 radii, and for grasps whose contacts all lie
     outside the shape's domain.
 
     >>> from torchgrasp import fit_shape, load_object

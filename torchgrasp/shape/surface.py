@@ -330,10 +330,10 @@ def surface_field(
 
     Args:
         shape: the shape, from `fit_shape`.
-        spacing: distance [m] of neighbouring nodes, 0.001 to 0.02.
+        spacing: distance [m] between neighbouring nodes, 0.001 to 0.02.
 
-    Raises `BadArgument` for another spacing, and for one that needs more than 2e7 nodes
-    (`FIELDS.most_nodes`). Raises it if the mean signed distance is nowhere zero, too.
+    Raises `BadArgument` for a spacing out of range, or one that needs more than 2e7 nodes
+    (`FIELDS.most_nodes`). It is also raised if the mean signed distance is nowhere zero.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> jug = load_object("jug")

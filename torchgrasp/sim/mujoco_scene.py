@@ -146,8 +146,8 @@ class MujocoScene(SimulatedScene):
         return self.data.qpos[self._positions]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip by the driven
-        joints.
+        """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip with respect to the
+        driven joints.
 
         The `points` (f, 3) [m] are in the world's frame.
         """

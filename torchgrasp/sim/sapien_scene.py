@@ -170,8 +170,8 @@ class SapienScene(SimulatedScene):
         return np.asarray(self.hand.get_qpos(), float)[self._places]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip by the driven
-        joints.
+        """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip with respect to the
+        driven joints.
 
         The `points` (f, 3) [m] are in the world's frame.
         """

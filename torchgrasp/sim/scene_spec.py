@@ -122,8 +122,8 @@ class SceneSpec:
         travel: largest height [m] of a lift.
         approach: displacement (x, y, z) [m] from the hand's start to the pose `world_from_hand`.
         table: whether there is a table.
-        patch: radius [m] of a fingertip's contact patch. Torsional friction is friction x force x
-            patch.
+        patch: radius [m] of a fingertip's contact patch. The torque of torsional friction is
+            friction x force x patch.
         height: height [m] of the table; None means the lowest point of the mesh.
         edge: (x, y, offset) of a table that ends. It fills the points below its height whose
             coordinate [m] along the horizontal unit vector (x, y) is less than the offset [m]. None
@@ -216,12 +216,14 @@ class SceneSpec:
 
     @property
     def table_height(self) -> float:
-        """The height [m] of the table: `height`, or the lowest point of the object's mesh."""
+        """The height [m] of the table along the world's z: `height`, or the lowest point of the
+        object's mesh if that is None.
+        """
         return float(self.mesh.bounds[0, 2]) if self.height is None else self.height
 
     @property
     def ledge(self) -> "Ledge":
-        """The box that is the table, if the table has an `edge`.
+        """The table as a box, for a table with an `edge`.
 
         The box is under the object. It ends at the edge, or `SIMULATION.reach` [m] beyond the
         object's middle if the edge is farther.
@@ -261,7 +263,9 @@ class SceneSpec:
 
     @checked
     def check_drives(self, names: list[str]) -> None:
-        """Raise `BadArgument` if a joint in `names` is missing in `joints` or in `drives`."""
+        """Raise `BadArgument` if a joint of `names` lacks a start position in `joints` or a drive
+        in `drives`.
+        """
         missing = [name for name in names if name not in self.joints or name not in self.drives]
         if missing:
             found = f"no position or drive for {missing}"

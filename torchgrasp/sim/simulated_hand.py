@@ -69,11 +69,11 @@ class SimulatedHand:
         finger: mask (f,) of the fingers that touched the object in the last timestep.
         steps: number of timesteps so far.
         sent: targets (j,) [rad or m] of the last tick, in the order of `scene.joint_names`.
-        first_touch: timestep (f,) of each fingertip's first contact with the object; infinite
-            before it.
-        first_stray: timestep (3,) of the hand's first unintended contact. The entries are for a
-            neighbour, for the table, and for the object. The last is of a link that neither is nor
-            carries a fingertip. Infinite before it.
+        first_touch: number (f,) of the timestep of each fingertip's first contact with the object;
+            infinite before it.
+        first_stray: number (3,) of the timestep of the hand's first unintended contact: with a
+            neighbour, with the table, with the object. With the object, contacts of fingertips and
+            the links that carry them do not count. Infinite before it.
         stray: sums of the impulses (3,) [N s] of these contacts.
         most_stray: largest force (3,) [N] of these contacts, averaged over a tick.
         period: time [s] of a control tick.

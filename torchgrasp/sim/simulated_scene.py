@@ -30,15 +30,15 @@ class StepContacts:
 
     Attributes:
         impulse: normal impulse (f, 3) [N s] of each fingertip on the object, without friction.
-        moment: contact points (f, 3) [N s m] of each fingertip, summed with the size of their
-            normal impulse as weight. `moment / weight` is the mean contact point [m].
-        weight: sum (f,) [N s] of these sizes.
+        moment: sum (f, 3) [N s m] of each fingertip's contact points, weighted by the size of their
+            normal impulse. `moment / weight` is the mean contact point [m].
+        weight: sum (f,) [N s] of these weights.
         finger: mask (f,) of the fingers that touch the object, with the fingertip or with the link
             that carries it.
         force: force (f, 3) [N] of each fingertip on the object, with friction.
-        stray: sums (3,) [N s] of the sizes of the hand's other normal impulses: on neighbours, on
-            the table, on the object. On the object, fingertips and the links that carry them do
-            not count.
+        stray: sums (3,) [N s] of the sizes of the hand's unintended normal impulses: on neighbours,
+            on the table, on the object. On the object, those of fingertips and the links that carry
+            them do not count.
     """
 
     impulse: np.ndarray
@@ -187,7 +187,8 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) of one point on each fingertip by the driven joints.
+        """Return the Jacobian (f, 3, j) of one point on each fingertip with respect to the driven
+        joints.
 
         Points and result are in the world's frame. The unit is [m/rad]; columns of sliding joints
         have none.

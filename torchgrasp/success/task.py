@@ -29,15 +29,15 @@ class GraspTask(Value):
     Args:
         mass: mass [kg] of the object, 0.001 to 10, or its `Distribution`.
         force: normal force [N] of the strongest finger. None means 4 N in pulls. In a lift it means
-            as much as the felt load needs.
+            as much as the measured load requires.
         lift: True means that the object is lifted off its table. False means pulls. The object
             floats, and is pulled along six directions with a force of 10 m/s^2 times its mass. None
             means a lift if the planner knows the table and the closing is not "open_loop".
         closing: how the hand closes.
             "uncertainty": by touch.
             "open_loop": without sensors, from pre-grasp to grasp to squeeze.
-        displaced: whether the object may be elsewhere than the camera saw it. This is up to 30 mm
-            along the table, or 5 mm and 5 degrees in pulls.
+        displaced: whether the object may have moved since the camera saw it: by up to 30 mm along
+            the table, or by up to 5 mm and 5 degrees in pulls.
 
     Raises `BadArgument` for a number outside its range, or a lift in open loop.
 
@@ -70,12 +70,12 @@ class GraspTask(Value):
 
     @checked
     def updated(self, result: ClosureResult) -> "GraspTask":
-        """Return the task of the next grasp, with the mass narrowed to what a lift has shown
+        """Return the task of the next grasp, with the mass narrowed to what a lift has measured
         (`ClosureResult.mass`).
 
-        `result` is what `close_hand` returned. Masses outside those that it shows are left out. If
-        none is left, the mass is what it shows. The task is returned as it is in two cases. The
-        lift showed no mass, or its status is neither `OK` nor `TOO_HEAVY`.
+        `result` is what `close_hand` returned. Masses that the lift excludes are left out. If none
+        is left, the mass is that of the lift. The task is returned as it is in two cases: the lift
+        measured no mass, or its status is neither `OK` nor `TOO_HEAVY`.
         """
         felt = result.mass
         if felt is None or result.status not in (Status.OK, Status.TOO_HEAVY):
@@ -92,8 +92,8 @@ class GraspTask(Value):
         """Return the normal force [N] of the strongest finger.
 
         This is the field `force`. If that is None, it is 4 N in pulls and 0 in a lift. In a lift
-        the hand presses as much as the felt load needs. `lifted` says whether the task is a lift,
-        as `lifts` returns it.
+        the hand presses as much as the measured load requires. `lifted` says whether the task is a
+        lift, as `lifts` returns it.
         """
         return self.force or (0.0 if lifted else 4.0)
 

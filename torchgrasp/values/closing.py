@@ -214,8 +214,8 @@ class ClosingOptions(Value):
         wait: whether a finger that touches waits for the others, so that all press together.
         pose_estimate: whether early and late touches update the estimated object pose, which moves
             all contact targets.
-        palm_reach: largest displacement [m] of the palm, which follows the estimated object pose. 0
-            means that the palm does not move.
+        palm_reach: largest displacement [m] of the palm, by which it follows the estimated object
+            pose. 0 means that the palm does not move.
         stops: how often the approaching hand may stop at an unexpected contact and move sideways; 0
             means never.
         attempts: largest number of closings. On a known table the hand closes again if the grasp

@@ -42,7 +42,7 @@ class Distribution(Value):
     Further ways to make a distribution are `parse`, `read`, `of`, `between` and `of_samples`.
 
     Args:
-        parts: intervals (least, greatest), 1 to 10,000 of them.
+        parts: intervals (least, greatest) in the unit of the number, 1 to 10,000 of them.
         weights: weight of each part, of which only the ratios count; None means equal weights.
 
     Raises `BadArgument` for:
@@ -72,7 +72,8 @@ class Distribution(Value):
     @classmethod
     @checked
     def of(cls, value: "float | Distribution") -> "Distribution":
-        """Return the distribution of a number that is certain: its only part is (value, value).
+        """Return the distribution of a number that is certain, in the unit of the number. Its only
+        part is the interval (value, value).
 
         A `Distribution` is returned as it is.
         """
@@ -172,12 +173,12 @@ class Distribution(Value):
 
     @property
     def least(self) -> float:
-        """The least number that is possible."""
+        """The smallest possible value, in the unit of the number."""
         return min(low for low, _ in self.parts)
 
     @property
     def most(self) -> float:
-        """The greatest number that is possible."""
+        """The greatest possible value, in the unit of the number."""
         return max(high for _, high in self.parts)
 
     @kept
@@ -209,7 +210,7 @@ class Distribution(Value):
 
     @checked
     def times(self, factor: Positive) -> "Distribution":
-        """Return the distribution of `factor` times the number.
+        """Return the distribution of the number multiplied by `factor` (no unit).
 
         Raises `BadArgument` for a `factor` that is not positive.
         """
@@ -220,8 +221,8 @@ class Distribution(Value):
         """Return the distribution with the ends of each interval clamped to [low, high]; weights
         are kept.
 
-        An interval outside becomes the nearer of the two numbers. `low` and `high` may be infinite.
-        Raises `BadArgument` if `low` is the greater one.
+        An interval outside becomes the nearer of the two numbers. `low` and `high` have the unit of
+        the number, and may be infinite. Raises `BadArgument` if `low` is the greater one.
         """
         if low > high:
             raise BadArgument("low", f"{low:g} beside high {high:g}", "at most high")
@@ -234,7 +235,8 @@ class Distribution(Value):
 
     @checked(gradients=True)
     def cdf(self, x: Annotated[Float[Tensor, "*b"], ANY]) -> Float[Tensor, "*b"]:
-        """Return the probability (*b,) that the number is at most `x` (*b,); NaN for NaN.
+        """Return the probability (*b,) that the number is at most `x` (*b,), in the unit of the
+        number; NaN for NaN.
 
         The result is differentiable in `x`. The derivative is the density of the intervals; it does
         not show the jumps at single numbers.
@@ -252,12 +254,12 @@ class Distribution(Value):
 
     @checked(gradients=True)
     def quantile(self, q: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Return for each probability `q` (*b,) in [0, 1] the least number x (*b,) with
-        `cdf`(x) >= q.
+        """Return the quantile (*b,) for each probability `q` (*b,) in [0, 1], in the unit of the
+        number.
 
-        The result is differentiable in `q`. The derivative is one over the density, and 0 where x
-        is a single number. Raises `BadArgument` for a `q` outside [0, 1]; torch.vmap and
-        torch.compile leave this check out.
+        It is the least number x with `cdf`(x) >= q. The result is differentiable in `q`. The
+        derivative is one over the density, and 0 where x is a single number. Raises `BadArgument`
+        for a `q` outside [0, 1]; torch.vmap and torch.compile leave this check out.
         """
         if is_known(q) and not bool(((q >= 0) & (q <= 1)).all()):
             raise BadArgument("q", "a number outside [0, 1]", "probabilities in [0, 1]")
@@ -270,7 +272,8 @@ class Distribution(Value):
 
     @checked
     def sample(self, count: Few, seed: Seed) -> Float[Tensor, "n"]:
-        """Return `count` independent random numbers (count,), as float64 on the CPU.
+        """Return `count` independent random samples (count,) in the unit of the number, as float64
+        on the CPU.
 
         `count` is 1 to 10,000, and `seed` the random seed.
 
@@ -282,9 +285,10 @@ class Distribution(Value):
 
     @checked
     def share(self, low: Measured, high: Measured) -> float:
-        """Return the probability that the number is in [low, high], both ends included.
+        """Return the probability, in [0, 1], that the number is in [low, high], both ends included.
 
-        The ends may be infinite. The result is 0 if `low` is greater than `high`.
+        The ends have the unit of the number, and may be infinite. The result is 0 if `low` is
+        greater than `high`.
         """
         upto = self._below(real([high]), reached=True)
         below = self._below(real([low]), reached=False)
@@ -294,7 +298,8 @@ class Distribution(Value):
     def given(self, low: Measured, high: Measured) -> "Distribution":
         """Return the distribution of the number once it is known to be in [low, high].
 
-        The ends may be infinite. Raises `BadArgument` if the number cannot be in this interval.
+        The ends have the unit of the number, and may be infinite. Raises `BadArgument` if the
+        number cannot be in this interval.
 
         >>> str(Distribution.between(0.2, 1.0).given(0.3, 0.5))
         '0.3:0.5'

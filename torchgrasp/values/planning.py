@@ -228,8 +228,7 @@ class ContactPlan(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Certificate(Batch):
-    """The verdict whether each of b contact sets has frictional form closure (Eq. 13), with its
-    proof.
+    """Whether each of b contact sets has frictional form closure (Eq. 13), with a proof.
 
     `certify` returns it, and `closed` is the answer. f counts the fingertips of a set. The wrenches
     w of a set are the columns of W. They are forces along the edges of its friction cones, then
@@ -461,8 +460,8 @@ class Grasps(Batch):
         return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 
     def show(self, cloud: Any = None, hand: Any = None) -> Any:
-        """Return a sheet of the best grasps. It has a table of up to five executable ones, and a
-        picture of the first.
+        """Return a sheet for notebooks: a table of up to five executable grasps, and a picture of
+        the first.
 
         A notebook shows both, and `print` shows the table. The attribute `picture` of the sheet
         holds the picture as PNG; it is None if no grasp is executable.

@@ -57,20 +57,20 @@ class ContactSpec(Value):
         flatness: largest angle [rad] between the normals at a contact and on a ring around it. None
             means that flatness is not checked.
         flat_radius: radius [m] of the ring. None means the largest of 8, 6, 4 and 3 mm
-            (`FLAT_RADII`) that the object allows. `plan_grasps` then goes down to 1 mm (`RIM`) for
-            an object on a table without grasps.
+            (`FLAT_RADII`) that the object allows. If `plan_grasps` finds no grasp on a table, it
+            then goes down to 1 mm (`RIM`).
         table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means no
             table.
         tip_radius: radius [m] of the fingertips, balls that must stay above the table; 0 means
             points. None means the radius of the hand's fingertips, but at least 12 mm
             (`TIP_RADIUS`).
-        start_radius: radius, normalised, of the sphere on which initial guesses are drawn, around
-            the centre of the shape's frame (Sec. 6.2).
+        start_radius: radius, normalised, of the sphere on which initial guesses are drawn. Its
+            centre is that of the shape's frame (Sec. 6.2).
         fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
         contact_allowed: whether links may touch and push the target's neighbours. Such collisions
             then lower the predicted success, but do not make a grasp fail.
         region: where contacts may be: a `Region`, or a function of points (n, 3) [m] that returns
-            their signed distances (n,) [m], negative there. None means anywhere.
+            their signed distances (n,) [m], negative inside. None means anywhere.
 
     Raises `BadArgument` for a number outside its range, or an argument of another type.
 
@@ -110,7 +110,8 @@ class ContactSpec(Value):
 
     @checked
     def updated(self, result: ClosureResult) -> "ContactSpec":
-        """Return this spec with the `friction` that a closing has shown (`ClosureResult.friction`).
+        """Return this spec with the `friction` that a closing has measured
+        (`ClosureResult.friction`).
 
         `result` is what `close_hand` returned. If its `friction` is None, the spec is returned as
         it is.
@@ -200,9 +201,9 @@ class ContactSpec(Value):
         With a table, three specs follow for the upper rim of a low object. They have a
         `flat_radius` of 1 mm (`RIM`). There a fingertip on the table touches an inclined surface.
         The estimated rim is too round, so its normals are too steep. Therefore the second spec
-        gives up half of two margins, and the third spec all. The margin of the friction is given up
-        as `planned_friction` rises to `mean_friction`. The margin of a `tip_radius` of None is
-        given up, too. It falls from at least 12 mm (`TIP_RADIUS`) to `radius`.
+        gives up half of two margins, and the third spec all of them. The first margin is that of
+        the friction: `planned_friction` rises to `mean_friction`. The second is that of a
+        `tip_radius` of None: it falls from at least 12 mm (`TIP_RADIUS`) to `radius`.
 
         There are no specs if `flatness` is None, or if `flat_radius` is not None.
 
@@ -251,7 +252,7 @@ class ContactSpec(Value):
             friction: coefficient of friction between fingertip and object, or its `Distribution`.
             edges: number of edges of the linearised friction cone, at least 3.
             max_variance: largest variance of the signed distance at a contact, in squared
-                normalised units.
+                normalised units; one unit is `ShapeGP.scale` metres.
             table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means
                 no table.
 
@@ -311,13 +312,13 @@ class TrialSpec(Value):
             "position": PI control to goals behind the contacts.
             "open_loop": joint motion from pre-grasp to grasp to squeeze.
         holding: how the closed hand presses; after "open_loop" the squeeze is kept.
-            "grip": the forces that the felt load and a push of 2.5 N need.
+            "grip": as strong as the measured load plus a push of 2.5 N requires.
             "force": balanced forces, of which `force` sets the strength.
             "impedance": virtual springs keep the fingertips together and in place.
             "position": joint targets are kept.
             "law": Eq. 25 continues.
-            None means "grip", or "force" in three cases. `force` is given, the closing is not
-              "uncertainty" or "fixed", or a fingertip has no working tactile sensor.
+            None means "grip". It means "force" in three cases: `force` is given, the closing is
+              neither "uncertainty" nor "fixed", or a fingertip has no working tactile sensor.
         mass: mass [kg] of the object, 0.001 to 10. From a `Distribution` each trial draws it by its
             seed.
         friction: coefficient of friction of every contact, 0 to 10. From a `Distribution` each
@@ -335,11 +336,12 @@ class TrialSpec(Value):
         control_rate: rate [Hz] of the controller.
         simulator: "sapien" or "mujoco".
         density: density [kg/m^3] of the object, in place of `mass`; None means that `mass` counts.
-        patch: radius [m] of the contact patch of a fingertip. Torsional friction is friction x
-            force x patch. With 0 the contacts are hard points, as in the paper.
+        patch: radius [m] of the contact patch of a fingertip. The torque of torsional friction is
+            friction x force x patch. With 0 the contacts are hard points, as in the paper.
         kp: stiffness [N m/rad] of all joint drives; None means the hand's own.
-        overlap: depth [m] by which the hand may penetrate the object or the table at the start. The
-            convex parts that stand for the object bulge a little. A deeper overlap ends the trial.
+        overlap: depth [m] by which the hand may penetrate the object or the table at the start. It
+            is above 0 because the object's convex parts bulge a little. A deeper overlap ends the
+            trial.
         table: whether the object stands on a table; without one it falls, unless `gravity` is 0.
         self_collision: whether links of the hand collide with each other, in the pairs that the
             hand names.
@@ -409,10 +411,10 @@ class TrialSpec(Value):
     def pressing(self) -> HoldingMode:
         """The holding mode of the trial, such as "grip".
 
-        This is the field `holding`. If that is None, it is "force" in three cases. `force` is
-        given, `closing` is not "uncertainty" or "fixed", or a fingertip has no working tactile
-        sensor. Otherwise it is "grip". After the closing "open_loop" the mode is not used: the
-        squeeze is kept.
+        This is the field `holding`, if that is not None. Otherwise it is "grip", or "force" in
+        three cases: `force` is given, `closing` is neither "uncertainty" nor "fixed", or a
+        fingertip has no working tactile sensor. After the closing "open_loop" the mode is not used:
+        the squeeze is kept.
         """
         default = default_holding(self.sensor, self.closing) if self.force is None else "force"
         return self.holding or default
@@ -430,9 +432,8 @@ class TrialSpec(Value):
     def components(self) -> ClosingOptions:
         """The `ClosingOptions` with which the hand closes.
 
-        For the closing "uncertainty" or "fixed" they are the field `options`, or
-        `ClosingOptions()` if that is None. Other closings have no options: the result then has all
-        of them off.
+        For the closing "uncertainty" or "fixed" they are the field `options`, or `ClosingOptions()`
+        if that is None. Other closings have no options: for them all options are off.
 
         >>> TrialSpec(closing="paper").components.wait
         False

@@ -126,8 +126,8 @@ def show_grasps(
         hand: the hand of the grasps; None means the shipped hand that `grasps.meta` names.
         browser: whether the page is opened; False only writes it.
 
-    Raises `BadArgument` for a cloud that the grasps do not touch. Raises it also for a hand other
-    than that of the grasps. Without `hand` it is also raised if the grasps name no hand.
+    Raises `BadArgument` for a cloud that the grasps do not touch, or for another hand than that of
+    the grasps. Without `hand` it is also raised if the grasps name no hand.
 
     >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
