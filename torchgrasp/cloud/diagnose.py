@@ -109,9 +109,8 @@ def diagnose_cloud(
 ) -> CloudReport:
     """Return the measured properties of a cloud, with advice on what would improve it.
 
-    At most 50,000 points (`DIAGNOSIS.measured`) are measured. At most 5000 of them
-    (`DIAGNOSIS.viewed`) show whether camera, vertical and table are right. They also show whether
-    there is a second body.
+    At most 50,000 points (`DIAGNOSIS.measured`) are measured. With at most 5000 of them
+    (`DIAGNOSIS.viewed`), camera, vertical and table are checked, and a second body is sought.
 
     Args:
         cloud: the points [m].

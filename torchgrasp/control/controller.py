@@ -71,7 +71,7 @@ class GraspController:
         reference: the closing plan, moved by `relook` to the object as a new view showed it.
         targets: the present `Targets`, which the last `step` returned.
         attempts: number of closings so far, with the present one.
-        stops: number of stops of the approach at an unexpected touch.
+        stops: how often the approach stopped at an unexpected touch.
 
     Raises `BadArgument` for:
 
@@ -189,8 +189,9 @@ class GraspController:
         """The share of force control (f,) of each finger at the last tick, from 0 to 1. It is
         lambda in Eq. (26) of the paper.
 
-        NaN while Eq. (25) does not command the fingers, as in closings without this law. In others
-        it is NaN before the first tick, in the hold, and while the hand opens again.
+        It is NaN while the control law of Eq. (25) does not command the fingers. This is always so
+        in closing modes without this law. In modes with it, this is so before the first tick, in
+        the hold, and while the hand opens again.
         """
         acts = self.hold is None and self.reopening is None and self.time > 0.0
         if acts and isinstance(self.closing, LawClosing):
@@ -215,8 +216,8 @@ class GraspController:
 
     @property
     def object_motion(self) -> Float[Tensor, "4 4"]:
-        """The motion (4, 4) [m] of the object since the plan, as a view (`relook`) and the touches
-        show it.
+        """The motion (4, 4) [m] of the object since the plan, estimated from a new view (`relook`)
+        and from touches.
 
         A rigid transform in the frame of the grasp, from the planned to the present object.
         """

@@ -166,7 +166,7 @@ class GraspTry:
 
     @property
     def lost(self) -> bool:
-        """Whether the hand felt in the lift that it loses the object (`LiftCheck`)."""
+        """Whether the hand detected in the lift that it loses the object (`LiftCheck`)."""
         return self.check.lost
 
     @property
@@ -218,10 +218,10 @@ class GraspTry:
         Without a `surface` it is simply the first of `others`. The same holds for grasps that were
         planned without a table or not ranked by success.
 
-        The `grasps` of the next try have in `meta` what this try has shown, as texts of a
-        `Distribution`. `meta["friction"]` is `controller.friction`, if the grasps were planned for
-        a distribution and it excludes 0. `meta["mass"]` [kg] is `controller.mass`, if the object
-        was too heavy.
+        What this try has measured is in `meta` of the next try's `grasps`, as texts of a
+        `Distribution`. `meta["friction"]` is `controller.friction`. It is set if the grasps were
+        planned for a distribution of friction, and if `controller.friction` excludes 0.
+        `meta["mass"]` [kg] is `controller.mass`, and is set if the object was too heavy.
         """
         if not len(self.others):
             return None

@@ -38,8 +38,8 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
 
     `LeRobotDataset(name, root=folder)` reads it. Each closing is an episode. Each control tick is a
     frame of the episode, except the last one. Positions [m] and quaternions (x, y, z, w) are in the
-    coordinate frame of the grasp. The hand's are those of its root link. There are no images and no
-    rewards.
+    coordinate frame of the grasp. The pose of the hand is that of its root link. There are no
+    images and no rewards.
 
     | feature | contents |
     | --- | --- |

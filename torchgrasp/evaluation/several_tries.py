@@ -55,7 +55,7 @@ def lift_grasps(
     """Lift an object with the first of several grasps; after a failed lift, try the next one.
     Return all tries.
 
-    The robot may feel that the object slides or stays behind (`LiftCheck`), or that it is too
+    The robot may detect that the object slides or stays behind (`LiftCheck`), or that it is too
     heavy. Then the hand goes down, opens and withdraws; the object stays where it is. The robot
     estimates the object's new pose from the touches. With a `trial.truth.camera` it looks at the
     object before each try. Of the remaining grasps it tries the one that most likely holds there

@@ -111,8 +111,8 @@ class ActuatedJoints(Value):
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
         """Raise `BadArgument` unless all `joints` are within their limits.
 
-        A limit may be exceeded by the rounding of float32. Raises `BadArgument` for all that
-        `check` refuses, as well.
+        A limit may be exceeded by the rounding of float32. Whatever `check` refuses also raises
+        `BadArgument`.
 
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.

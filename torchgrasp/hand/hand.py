@@ -128,9 +128,9 @@ class Hand(Value):
     def to(self, *args: Any, **kwargs: Any) -> "Hand":
         """Return the hand on another device or in another floating dtype.
 
-        The arguments are those of `torch.Tensor.to`. A hand that is already there is returned
-        itself. Raises `BadArgument` if the device does not exist, or the dtype is neither float32
-        nor float64.
+        The arguments are those of `torch.Tensor.to`. A hand that is already there is returned as it
+        is. Raises `BadArgument` if the device does not exist, or the dtype is neither float32 nor
+        float64.
         """
         check_moved(*args, **kwargs)
         if self.lower.to(*args, **kwargs) is self.lower:

@@ -119,7 +119,7 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
     """Return the same hand, on the same device, with other grasping fingers.
 
-    The hand's files are read again. A hand that has these fingers already is returned itself.
+    The hand's files are read again. A hand that already has these fingers is returned as it is.
 
     Args:
         hand: the hand.

@@ -46,9 +46,9 @@ class EdgePlan(Value):
             They are in the frame of the cloud, the best first, as those of `plan_grasps`. Their
             metadata hold the drag (`torchgrasp.planner.drag_of`), so that one file has both.
         shape: the estimated shape after the drag, in the same frame.
-        reason: why there is no drag, as a sentence; "" if there is one. The object may hang over
-            the edge far enough, or be too heavy. No posture of the hand may press on it. A
-            neighbour may be in its way. The edge may be too far outside what the camera saw.
+        reason: why there is no drag, as a sentence; "" if there is one. Reasons are: the object
+            already hangs over the edge far enough; it is too heavy; no posture of the hand can
+            press on it; a neighbour is in its way; the edge is too far outside what the camera saw.
     """
 
     drag: DragPlan | None

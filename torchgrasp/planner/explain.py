@@ -232,9 +232,9 @@ class Explanation(Value):
         """A sentence for the user on what would help most.
 
         It names the most helpful change. The user may be unable to make this change, such as a
-        higher friction. Then the sentence also names the most helpful change that the user can
-        make. If no change helps, the sentence names the stage that loses most candidates, and the
-        reason. If there is a grasp after all, it says so.
+        higher friction. Then the sentence also names the most helpful change among those that the
+        user can make. If no change helps, the sentence names the stage that loses most candidates,
+        and the reason. If there is a grasp after all, it says so.
         """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."

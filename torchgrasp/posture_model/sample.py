@@ -141,7 +141,7 @@ class HandSamples(Batch):
 class SampleSpec(Value):
     """The settings by which `write_samples` draws `n` postures without self-collision.
 
-    With equal seed and sampling, fewer postures are the first ones of a longer sequence.
+    With the same seed and sampling, a smaller `n` gives the first postures of a larger `n`.
 
     Args:
         n: number of postures, 1 to 100,000,000.
@@ -181,7 +181,7 @@ def sample_configurations(
 ) -> HandSamples:
     """Return `n` random postures within the joint limits and without self-collision (Sec. 6.3).
 
-    With equal `seed` and `sampling`, fewer postures are the first ones of a longer sequence.
+    With the same `seed` and `sampling`, a smaller `n` gives the first postures of a larger `n`.
 
     Args:
         hand: the hand.

@@ -223,8 +223,10 @@ class SceneSpec:
 
     @property
     def ledge(self) -> "Ledge":
-        """The table as a box, for a table with an `edge`.
+        """The table as a box, for a table with an `edge`: a named tuple (centre, half, axes).
 
+        `centre` (3,) [m] is its centre in the world's frame, and `half` (3,) [m] half its lengths.
+        The columns of `axes` (3, 3) are its axes: outward beyond the edge, along the edge, and up.
         The box is under the object. It ends at the edge, or `SIMULATION.reach` [m] beyond the
         object's middle if the edge is farther.
         """

@@ -201,8 +201,8 @@ class SimulatedScene(abc.ABC):
     def penetration(self) -> float:
         """Return the largest depth [m] by which the hand penetrates another body or itself.
 
-        It is at most 0 if the hand penetrates nothing. Call it before the first step. It is no mere
-        query: with SAPIEN it advances the scene by a timestep, in which objects do not fall.
+        It is at most 0 if the hand penetrates nothing. Call it before the first step. It may change
+        the scene: with SAPIEN it advances the scene by a timestep, in which objects do not fall.
         """
 
     @abc.abstractmethod

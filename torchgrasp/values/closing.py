@@ -80,7 +80,7 @@ class Disturbance(Value):
         first_touch: time (3,) [s] of the first contact; infinite if there is none.
         impulse: sum (3,) of the normal impulses [N s].
         force: largest normal force (3,) [N], averaged over a control tick.
-        early: whether (3,) the first contact of a kind was before a fingertip touched the object.
+        early: mask (3,) of the kinds whose first contact was before a fingertip touched the object.
         neighbour_pose: rigid transforms (t, m, 4, 4) [m] in the frame of the grasp, for t ticks and
             m neighbours. Each moves a neighbour from its start to its place at the tick.
     """
@@ -163,15 +163,15 @@ class ClosureResult(Value):
         phases: times (3,) [s] at which approach, closing and pressing ended. The closing ends when
             all fingers touch, or are given up. If the trial ended before, the first time is 0, and
             the others are NaN.
-        stops: number of stops of the approaching hand at a contact.
+        stops: how often the approaching hand stopped at a contact.
         attempts: number of closings of the hand.
         seconds: wall time [s] of the trial.
         friction: `Distribution` of the coefficient of friction. It is the planned distribution,
             limited to the interval that sticking and sliding fingertips allow. If the plan excludes
-            this interval, the touches alone decide. None if the hand did not hold in the mode
-            "grip".
-        mass: `Distribution` of the object's mass [kg], from the load that the hand felt while
-            nothing pushed at the object. None if the mode "grip" felt no steady load.
+            this interval, the distribution follows from the touches alone. None if the hand did not
+            hold in the mode "grip".
+        mass: `Distribution` of the object's mass [kg], from the load that the hand measured while
+            nothing pushed at the object. None if the mode "grip" measured no steady load.
     """
 
     held: bool

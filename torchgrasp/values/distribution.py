@@ -320,11 +320,11 @@ class Distribution(Value):
 
     @checked
     def nodes(self, count: Few) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """Return (numbers, probabilities): n nodes (n,) that stand for the distribution, and their
-        probabilities (n,).
+        """Return (numbers, probabilities): n nodes (n,) that stand for the distribution, in the
+        unit of the number, and their probabilities (n,).
 
-        The sum of probability times f(number) is about the mean of a function f. Here n is at most
-        `count` (1 to 10,000).
+        The sum of probability times f(number) approximates the mean of a function f. Here n is at
+        most `count` (1 to 10,000).
 
         A part that is a single number is one node. An interval is cut into equal pieces, and their
         middles are the nodes. The greater an interval's probability, the more pieces it has. If the

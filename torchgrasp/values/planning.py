@@ -72,9 +72,9 @@ class PointCloud(Value):
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
         """Return a cloud of some of the points, with their normals, cameras and pose errors.
 
-        `rows` is a mask (n,) of the points, or holds m indices of points in the wanted order. Raises
-        `BadArgument` for another shape or dtype, and `TooFewPoints` if fewer than 4 points are left.
-        Raises `IndexError` for an index beyond the last point.
+        `rows` is a mask (n,) of the points, or holds indices (m,) of points in the wanted order.
+        Raises `BadArgument` for another shape or dtype, and `TooFewPoints` if fewer than 4 points
+        are left. Raises `IndexError` for an index beyond the last point.
         """
         normals = self.normals
         eye = self.viewpoint
@@ -89,7 +89,7 @@ class PointCloud(Value):
         )
 
     def view_rows(self) -> list[Int[Tensor, "m"]]:
-        """Return the indices of the points of each camera, one tensor for each camera.
+        """Return the indices (m,) of the points of each camera, one tensor for each camera.
 
         The cameras are in the order of their first points. Without `viewpoint`, or with a single
         one, all points are of one camera.
@@ -257,7 +257,8 @@ class Certificate(Batch):
             the cloud.
         task_strength: normal force (b, f) [N] up to which each finger presses in this proof.
         task_twist: proof (b, 6) [1/N, 1/(N m)] that no greater multiple is resisted. It is a twist
-            y with y . t = -1: no admissible forces have a greater power along y.
+            y with y . t = -1. Along it, no admissible contact forces have a power greater than
+            `task_margin`.
 
     The `task_` fields are None without the argument `resist` of `plan_grasps`.
     """
@@ -374,20 +375,21 @@ class Grasps(Batch):
         normal_angle: angle (g, f) [rad] between the axis of a fingertip's pad and the inward normal
             of the object at its contact.
         certificate: proof of force closure (g rows).
-        score: log-odds (g,) of the predicted success. Executable grasps are in its order, unless
-            the argument `ranking` of `plan_grasps` is "variance". The score of failed grasps is
-            another number, which says nothing of success.
+        score: log-odds (g,) of the predicted success (no unit). Executable grasps are in the order
+            of their scores, unless the argument `ranking` of `plan_grasps` is "variance". The score
+            of a failed grasp is no log-odds and says nothing about success.
         status: `Status` code (g,): `OK` for an executable grasp, else the reason why it failed.
         meta: names, units, hashes and the seed of the plan, as text.
         known: mask (g,) of the grasps that are like those of the trials to which the success model
             was fitted. The success of other grasps is unknown. None means that all are known.
-        interval: 95 % confidence interval (g, 2), over families of objects. It is of the share of
-            grasps with this predicted success that held in trials. [0, 1] if the success is
-            unknown, [0, 0] for failed grasps. None if there are no bounds.
+        interval: 95 % confidence interval (g, 2), lower and upper end, of the success rate of
+            grasps with this predicted success. It comes from trials, by resampling families of
+            objects. [0, 1] if the success is unknown, [0, 0] for failed grasps. None if there are
+            no bounds.
         arm: joints (g, n) [rad or m] of the arm at the grasp; None without an arm.
-        ease: two numbers (g, 2) of the arm's straight way to the grasp (`torchgrasp.arm`). First
-            the least distance of a joint from its limits, over half its range. Then the least
-            manipulability, sqrt(det(J J^T)) [m^3]. 0 for failed grasps; None without an arm.
+        ease: two numbers (g, 2) for the arm's straight path to the grasp. Column 0 is the least
+            distance of a joint from its limits, over half its range (no unit). Column 1 is the
+            least manipulability, sqrt(det(J J^T)) [m^3]. 0 for failed grasps; None without an arm.
 
     Each index keeps the batch axis: `grasps[0]` is a batch of one, and `grasps[0].joints[0]` are
     its joints. For all joints of the hand see `Hand.expand`, for a 3D page

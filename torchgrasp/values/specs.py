@@ -193,7 +193,7 @@ class ContactSpec(Value):
 
     @checked
     def relaxed(self, below: Length, radius: Length) -> "Iterator[ContactSpec]":
-        """Yield weaker constraints for an object without grasps, the strictest first.
+        """Yield weaker constraints for an object for which no grasp was found, the strictest first.
 
         First come specs with a smaller `flat_radius`. They are 8, 6, 4 and 3 mm (`FLAT_RADII`), as
         far as they are less than `below`.
@@ -201,9 +201,9 @@ class ContactSpec(Value):
         With a table, three specs follow for the upper rim of a low object. They have a
         `flat_radius` of 1 mm (`RIM`). There a fingertip on the table touches an inclined surface.
         The estimated rim is too round, so its normals are too steep. Therefore the second spec
-        gives up half of two margins, and the third spec all of them. The first margin is that of
-        the friction: `planned_friction` rises to `mean_friction`. The second is that of a
-        `tip_radius` of None: it falls from at least 12 mm (`TIP_RADIUS`) to `radius`.
+        reduces two margins by half, and the third spec drops them. The first margin is that of the
+        friction: `planned_friction` rises to `mean_friction`. The second is that of a `tip_radius`
+        of None: it falls from at least 12 mm (`TIP_RADIUS`) to `radius`.
 
         There are no specs if `flatness` is None, or if `flat_radius` is not None.
 

@@ -71,11 +71,11 @@ def write_film(
         grasp: a single grasp.
         closure: the simulated closing of this grasp, from `close_hand`.
         mesh: the object's mesh [m] in the frame of the grasp.
-        direction: direction (x, y, z) from the object to the camera, of any length. The axis z is
-            up, along the normal of the grasp's table. The axis x points to the mesh's point
-            farthest from the vertical through its middle. Without a table the axes are those of the
+        direction: direction (x, y, z) from the object to the camera, of any length. Axis z is up,
+            along the normal of the grasp's table. Axis x points from the object's vertical centre
+            line to its farthest point, such as a handle. Without a table, the axes are those of the
             grasp's frame. None means a side from which all fingers are seen. The camera's elevation
-            is kept between 15 and 40 degrees or so.
+            is kept between about 15 and 40 degrees.
         rate: pictures in each second, 1 to 50.
         observer: function that is called after each picture, with the number of pictures done and
             the number of all pictures.
