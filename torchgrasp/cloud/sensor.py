@@ -118,7 +118,8 @@ class SensorNoise(Value):
         bias: standard deviation [m] of the smooth bias of the depth.
         bias_width: standard deviation [px] of the Gaussian blur that makes the bias smooth.
         shadow: whether pixels are missing that the stereo camera's second lens does not see.
-        flying: share [0 to 1] of the pixels at rims that fly, with a depth that is too great.
+        flying: share [0 to 1] of the pixels at rims that are flying pixels: their depth is too
+            great.
         flight: mean error [m] of the depth of flying pixels.
         lost_rim: share [0 to 1] of the pixels at rims that have no depth.
         lost: share [0 to 1] of all pixels that are missing at random.
