@@ -103,7 +103,7 @@ def partial_view(
     640 x 480 pixels.
 
     By default the noise is that of an active stereo camera. It has noisy and rounded disparities, a
-    smooth bias, and flying and missing pixels at rims. Pixels are missing at grazing angles, too.
+    smooth bias, and flying and missing pixels at rims. Pixels are also missing at grazing angles.
 
     Args:
         mesh: surface of the object [m].

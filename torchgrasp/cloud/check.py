@@ -51,7 +51,7 @@ CLOUD = CloudNumbers()
 def check_cloud(cloud: PointCloud) -> PointCloud:
     """Return the cloud itself if it is fit for grasp planning, else raise an error.
 
-    A flat cloud is fit, too.
+    A flat cloud is also fit.
 
     Raises:
         TooFewPoints: fewer than 4 distinct points.

@@ -122,10 +122,10 @@ def read_cloud(
     * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the columns of `.npy` as
       text. A first line may name the columns (x y z nx ny nz), or hold the number of points.
 
-    Arrays may also be images (h, w, 3) of points. Points with NaN or infinity are left out. Points
-    at (0, 0, 0) are left out if there are several, and so are many at any other one place. Points
-    whose normal is NaN or zero are left out.
-    If most normals are NaN or zero, all normals are left out instead.
+    Arrays may also be images (h, w, 3) of points. Points with NaN or infinity are left out. Several
+    points at (0, 0, 0) are left out, and so are many points at any other single place. Points whose
+    normal is NaN or zero are left out. If most normals are NaN or zero, all normals are left out
+    instead.
 
     Args:
         path: the file.
@@ -213,7 +213,7 @@ def cloud_from_array(
     measured.
 
     Not measured are points with NaN or infinity, and points at (0, 0, 0) if there are several.
-    Points whose normal is NaN or zero are left out, too. If most normals are NaN or zero, all
+    Points whose normal is NaN or zero are also left out. If most normals are NaN or zero, all
     normals are left out instead.
 
     Args:
@@ -242,10 +242,10 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
     """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically; return the path.
 
     Args:
-        cloud: the points [m]. Their normals, cameras and errors are written, too.
+        cloud: the points [m]. Their normals, cameras and errors are also written.
         path: a file ending in `.npz` or `.ply`.
-        table: plane of the table in the frame of the cloud, which is written, too. None without
-            one.
+        table: plane of the table in the frame of the cloud, which is also written. None without a
+            table.
 
     Raises `OutputError` if the file cannot be written. Raises `BadArgument` for another suffix, or
     for a table with an edge, which neither file can hold. `BadArgument` is also raised for a `.ply`

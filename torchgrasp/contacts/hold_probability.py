@@ -93,8 +93,8 @@ class CarriedWeight(Value):
 
     Args:
         mass: mass [kg] of the object, 0.001 to 10, or its `Distribution`.
-        center: centre of mass (3,) [m] in the frame of the contacts, or (b, 3), one for each of b
-            contact sets.
+        center: centre of mass (3,) [m] in the frame of the contacts. Or (b, 3) [m], one for each of
+            b contact sets.
         press: mean of the normal forces [N] with which the fingers press at the contacts.
         up: unit vector against gravity in the frame of the contacts; None means z.
         center_std: standard deviation [m] of the centre of mass along each of three axes.

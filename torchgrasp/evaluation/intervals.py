@@ -40,7 +40,7 @@ class Share(NamedTuple):
     """A success rate (or a mean, or a difference) with its 95 % interval; `summarise` makes it.
 
     The interval is found by resampling units, such as families of objects. With a single unit its
-    ends are NaN. Without trials the value is NaN, too.
+    ends are NaN. Without trials the value is also NaN.
 
     Attributes:
         value: the rate in [0, 1]; a mean or a difference has its own unit.

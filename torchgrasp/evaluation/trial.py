@@ -80,7 +80,7 @@ class Truth:
             It ends where the plan's table (`Grasps.table`) ends.
         neighbours: other bodies on the table, which the hand may push.
         slide: displacement (3,) [m] of the object along the table, halfway through the approach.
-            None means no displacement; without an approach there is none, too.
+            None means no displacement. Without an approach there is no displacement either.
         camera: pose (4, 4) [m] of a depth camera (x right, y down, z forward). With it the robot
             looks again before the approach. None means no second look.
     """

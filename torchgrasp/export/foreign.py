@@ -124,8 +124,8 @@ def read_foreign(
     MultiGripperGrasp's `dofs` are the joints with which its simulation starts. Its `final_dofs` and
     `result` are not read.
 
-    Coupled and parked joints of the file may differ from the hand's if no fingertip moves by more
-    than 0.1 mm. A `GraspFileWarning` names values that are not kept, and joints that bend backward.
+    Coupled and parked joints of the file may differ from the hand's if this moves no fingertip by
+    over 0.1 mm. A `GraspFileWarning` names values that are not kept, and joints that bend backward.
     It also tells if an `isaac_grasp` file names no hand in its first line or in the gripper's path.
 
     Args:

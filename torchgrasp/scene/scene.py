@@ -103,9 +103,10 @@ class Scene(Value):
         points: the n measured points (n, 3) [m].
         labels: label (n,) of each point: 1, 2, ... for the objects, 0 for the table and everything
             else.
-        image: the camera's depth image. Its fields are `depth` (h, w) [m], 0 where nothing was
-            measured, `intrinsics` (3, 3) [pixels] and `obj_from_camera` (4, 4) [m]. Its field
-            `bounded` is False if the image was rendered from a cloud, and so has no true border.
+        image: the camera's depth image. Its fields are `depth` (h, w) [m], `intrinsics` (3, 3)
+            [pixels] and `obj_from_camera` (4, 4) [m]. The depth is 0 where nothing was measured.
+            Its field `bounded` is False if the image was rendered from a cloud, and so has no true
+            border.
         pixels: row and column (n, 2) of each point in the image.
         table: the plane that the objects stand on, or None if it is unknown.
         target: label of the object to be grasped, or None if none is chosen.

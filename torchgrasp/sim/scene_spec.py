@@ -125,9 +125,9 @@ class SceneSpec:
         patch: radius [m] of a fingertip's contact patch. The torque of torsional friction is
             friction x force x patch.
         height: height [m] of the table; None means the lowest point of the mesh.
-        edge: (x, y, offset) of a table that ends. It fills the points below its height whose
-            coordinate [m] along the horizontal unit vector (x, y) is less than the offset [m]. None
-            means that the table does not end.
+        edge: (x, y, offset) of a table that ends, with a horizontal unit vector (x, y) and an
+            offset [m]. The table fills points below its height whose coordinate [m] along this
+            vector is less than the offset. None means that the table does not end.
         neighbours: other bodies on the table, each a `Body`.
         self_pairs: names of the two links of each pair of the hand's links that can collide.
         yields: largest displacement [m] of the mount along each axis of the world, beside approach

@@ -281,8 +281,8 @@ class SensorModel(Value):
             tactile normal force, and 0.01 N m of a joint torque.
         dead: names of the fingers whose sensor is known to be broken.
 
-    Raises `BadArgument` for a number outside its range, or an unknown kind. An unknown finger
-    raises it only where the model meets a hand, as in `close_hand`.
+    Raises `BadArgument` for a number outside its range, or an unknown kind. Names in `dead` are
+    only checked where the model meets a hand, as in `close_hand`.
 
     >>> SensorModel("binary").full
     False
