@@ -23,7 +23,7 @@ from torchgrasp.export import (
     read_foreign,
 )
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector
 
 yaml = pytest.importorskip("yaml")
 DRIVER = {
@@ -51,8 +51,14 @@ def test_a_turned_world_turns_the_retreat_with_it():
         rotation_from_vector(torch.tensor([0.3, -0.8, 0.2]).double()),
         torch.tensor([0.1, 0, 0.2]).double(),
     )
+    contacts = dataclasses.replace(
+        grasp.contacts,
+        points=apply(turn, grasp.contacts.points),
+        normals=rotate(turn, grasp.contacts.normals),
+    )
     turned = dataclasses.replace(
         grasp,
+        contacts=contacts,
         obj_from_hand=turn @ grasp.obj_from_hand,
         approach=grasp.approach @ turn[:3, :3].T,
         meta=grasp.meta | {"table": Plane.horizontal(0.0).moved(turn).describe()},

@@ -15,11 +15,14 @@ from torchgrasp.contacts.balance import least_friction_forces
 from torchgrasp.foundation.base import Value, named_tensors, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import Force, Positive, check_dense
+from torchgrasp.foundation.rules import Force, Positive, check_dense, is_known
 from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.hand.drives import joint_stiffness
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps
+
+CHANGED = 1e-3  # change [m] of a fingertip's place that shows another geometry: above rounding
 
 
 @checked
@@ -121,7 +124,7 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
 
     Raises `BadArgument` for:
 
-    * joints or fingers of another hand;
+    * joints or fingers of another hand, or of one whose geometry has changed since the plan;
     * a `force` outside [0.01, 100] N, or a stiffness that is not positive;
     * contacts or poses that require gradients.
 
@@ -142,9 +145,11 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
 
 
 def check_same_hand(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` if grasps are not the hand's: by its name, their fingers or joints.
+    """Raise `BadArgument` if grasps are not the hand's: by its name, their fingers or joints, or
+    where their joints place its fingertips.
 
-    Grasps whose metadata name no hand, fingers or joints need only the number of each.
+    Grasps whose metadata name no hand, fingers or joints need only the number of each. The places
+    are compared if the files of the hand are not those of the plan.
     """
     planned = grasps.meta.get("hand", hand.name)
     if planned != hand.name:
@@ -163,6 +168,28 @@ def check_same_hand(hand: Hand, grasps: Grasps) -> None:
     if named != ",".join(hand.joint_names):
         ours = ", ".join(hand.joint_names)
         raise BadArgument("grasps", f"the joints {named}", f"those of the hand: {ours}")
+    if grasps.meta.get("hand_sha256") != hand.source.sha256 and is_known(grasps.joints):
+        _check_reached(hand, grasps)
+
+
+@torch.no_grad()
+def _check_reached(hand: Hand, grasps: Grasps) -> None:
+    """Raise `BadArgument` if fingertips are farther from their contacts than they were planned.
+
+    Then the hand's geometry is another one than that of the plan.
+    """
+    grasps = grasps.to("cpu", torch.float64)
+    points, normals = contacts_in_hand(grasps)
+    hand = hand.to("cpu", torch.float64)
+    pads, _ = hand.fingertips(grasps.joints)
+    centres = hand.tip_centres(grasps.joints)
+    rolled = points + hand.tips.radius[:, None] * normals
+    # the pad lies at the contact, or the fingertip has rolled on it
+    off = torch.minimum(norm(pads - points), norm(centres - rolled))
+    if bool((off > grasps.tip_error + CHANGED).any()):
+        most = 1000 * float(off.nan_to_num().max())
+        found = f"{hand.name}, whose fingertips are up to {most:.0f} mm off the contacts"
+        raise BadArgument("hand", found, "the hand with which the grasps were planned")
 
 
 def press(

@@ -109,6 +109,7 @@ class ClosingReference(Value):
         Raises `BadArgument` for:
 
         * not exactly one grasp, or a grasp of another hand or other fingers;
+        * a hand whose geometry has changed since the plan;
         * joints beyond their limits, or numbers in the grasp that are not finite;
         * contacts without `std_m`;
         * a `force` outside [0.01, 100] N, or a stiffness that is not positive;
