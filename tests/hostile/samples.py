@@ -14,7 +14,6 @@ import torch
 import trimesh
 from jaxtyping import AbstractArray
 from torch import Tensor
-from typing_extensions import Unpack
 
 import torchgrasp
 from tests.arm.ur5e import ur5e
@@ -60,12 +59,8 @@ NONE: Lengths = types.MappingProxyType({})
 
 
 def hints_of(thing: Any) -> dict[str, Any]:
-    """Return the annotations of a function or dataclass with their marks, those of `**options`
-    among them.
-    """
+    """Return the annotations of a function or dataclass with their marks."""
     hints = typing.get_type_hints(thing, include_extras=True)
-    for hint in [x for x in hints.values() if typing.get_origin(x) is Unpack]:
-        hints |= typing.get_type_hints(typing.get_args(hint)[0], include_extras=True)
     return {name: hint for name, hint in hints.items() if name != "return"}
 
 

@@ -25,7 +25,6 @@ import torch
 from beartype.door import is_bearable
 from jaxtyping import Float
 from torch import Tensor
-from typing_extensions import Unpack
 
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import (
@@ -163,9 +162,7 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
                 continue
             hint = hints[name]
             if name == options:
-                arguments[name] = {
-                    k: _read(k, x, _option(hint, k), shared) for k, x in value.items()
-                }
+                arguments[name] = {k: _read(k, x, hint, shared) for k, x in value.items()}
             elif name == rest:
                 arguments[name] = tuple(
                     _read(f"{name}[{i}]", x, hint, shared) for i, x in enumerate(value)
@@ -480,18 +477,6 @@ def _hint(name: str, signature: inspect.Signature, owner: Any) -> str:
                 return f"; {name} is a field: {option}={kind.__name__}({name}=...)"
     near = difflib.get_close_matches(name, list(signature.parameters), 1)
     return f"; did you mean {near[0]}?" if near else ""
-
-
-def _option(hint: Any, key: str) -> Any:
-    """Return the type annotation of the keyword argument `key` of `**options`; raise `TypeError` if
-    there is none.
-    """
-    options = _hints(typing.get_args(hint)[0]) if typing.get_origin(hint) is Unpack else {key: hint}
-    if key not in options:
-        raise TypeError(
-            f"got an unexpected keyword argument {key!r}: expected one of {', '.join(options)}"
-        )
-    return options[key]
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
