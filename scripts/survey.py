@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-PLAIN = {0.0, 1.0, 2.0, 0.5, 3.0, 4.0, 10.0, 100.0, 1000.0, 180.0, 90.0, 360.0, 9.81}
-"""Numbers with a point that a function body may have: neutral ones, units and gravity."""
+PLAIN = {0.0, 1.0, 2.0, 0.5, 3.0, 4.0, 10.0, 100.0, 1000.0, 180.0, 90.0, 360.0}
+"""Numbers with a point that a function body may have: neutral ones and units."""
 FEW = range(-4, 11)
 """Whole numbers that a function body may have: axes, rows and small counts."""
 COUNTED = {tokenize.NAME, tokenize.OP, tokenize.NUMBER}

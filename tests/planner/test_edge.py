@@ -29,8 +29,8 @@ from torchgrasp.planner.edge import _brought, plan_edge_grasps
 from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
 from torchgrasp.shape.surface import Mesh, extract_mesh
-from torchgrasp.success.task import TASKS
 from torchgrasp.values.distribution import Distribution
+from torchgrasp.values.specs import GRAVITY
 
 HANDS = ["allegro", "barrett"]
 HALF = real(SIZE) / 2
@@ -138,9 +138,9 @@ def test_grasps_are_of_the_object_where_the_drag_leaves_it(found):
 def test_the_pressing_force_moves_the_object_by_coulombs_law(friction, table, mass):
     force = pressing_force(mass, friction, table)
     pressed = torch.linspace(0.0, 100.0, 1_000_001).double()
-    moves = friction * pressed > table * (pressed + mass * TASKS.gravity)
+    moves = friction * pressed > table * (pressed + mass * GRAVITY)
     least = float(pressed[moves].min())
-    wanted = max(DRAG.reserve * least, DRAG.weights * mass * TASKS.gravity, DRAG.least)
+    wanted = max(DRAG.reserve * least, DRAG.weights * mass * GRAVITY, DRAG.least)
     wanted = min(wanted, DRAG.most)
     if DRAG.enough * least > DRAG.most:
         assert force is None
@@ -300,7 +300,7 @@ def test_postures_that_press_steadily_drag_and_do_not_slip():
     ways = torch.stack([angle.cos(), angle.sin(), torch.zeros(6).double()], 1)
     steady = _is_steady(postures, ways)
     pressed = pressing_force(dragged.MASS, FRICTION, TABLE_FRICTION)
-    weight = dragged.MASS * TASKS.gravity
+    weight = dragged.MASS * GRAVITY
     unsteady = 0
     for p, t in ((p, t) for p in range(0, len(postures), 8) for t in range(len(ways))):
         fingers = torch.nonzero(postures.presses[p])[:, 0].tolist()

@@ -51,7 +51,7 @@ from torchgrasp.geometry.linalg import dot, eye_like, norm, perpendicular, unit
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values.distribution import Distribution, check_within
 from torchgrasp.values.planning import Contacts
-from torchgrasp.values.specs import FRICTIONS, MASSES
+from torchgrasp.values.specs import FRICTIONS, GRAVITY, MASSES
 
 TILTS = Range(0.0, math.pi)
 """The standard deviations [rad] of a normal that are possible."""
@@ -77,8 +77,6 @@ class HoldProbabilityNumbers:
     """Pairs of a contact set and a part of the distribution that are computed at a time."""
     masses: int = 9
     """Number of ranges of an uncertain mass, in each of which the critical friction is linear."""
-    gravity: float = 9.81
-    """Acceleration [m/s2] of the weight."""
 
 
 HOLD = HoldProbabilityNumbers()
@@ -355,7 +353,7 @@ def _mass_ranges(law: Distribution) -> list[tuple[float, float, float]]:
 def _force(weight: CarriedWeight, mass: float, like: Tensor) -> Float[Tensor, "3"]:
     """Return the weight of a `mass` [kg] as a force, over the mean normal force."""
     up = eye_like(3, like)[2] if weight.up is None else weight.up.to(like)
-    return -mass * HOLD.gravity / weight.press * up
+    return -mass * GRAVITY / weight.press * up
 
 
 def _center(weight: CarriedWeight, points: Vectors) -> Float[Tensor, "b 3"]:

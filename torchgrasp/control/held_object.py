@@ -15,6 +15,7 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import smooth
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.values.distribution import Distribution
+from torchgrasp.values.specs import GRAVITY
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,8 +72,6 @@ class WeightNumbers:
     """Standard deviation of the mean load by motion and oblique contacts, as a share of it."""
     sure: float = 2.0
     """Standard deviations within which a mass is likely."""
-    gravity: float = 9.81
-    """Acceleration [m/s^2] of a weight."""
     most: float = 10.0
     """Largest mass [kg] of an object."""
 
@@ -206,13 +205,13 @@ class LoadEstimate:
             return None
         std = math.hypot(WEIGHT.noise / math.sqrt(self.weighings), WEIGHT.share * load)
         around = WEIGHT.sure * std
-        low = max(load - around, 0.0) / WEIGHT.gravity
-        return Distribution.between(low, (load + around) / WEIGHT.gravity)
+        low = max(load - around, 0.0) / GRAVITY
+        return Distribution.between(low, (load + around) / GRAVITY)
 
     @property
     def exceeded(self) -> Distribution:
         """The mass [kg] of an object that is heavier than the largest load so far."""
-        carried = (1 - WEIGHT.sure * WEIGHT.share) * self.most / WEIGHT.gravity
+        carried = (1 - WEIGHT.sure * WEIGHT.share) * self.most / GRAVITY
         return Distribution.between(min(carried, WEIGHT.most), WEIGHT.most)
 
     def _possible(self, felt: np.ndarray) -> np.ndarray:
@@ -250,7 +249,7 @@ def likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:
         middle = field.origin + field.spacing * inside.double().mean(0)
         centre = apply(inverse(reference.obj_from_hand), middle[None])[0]
         mass = WEIGHT.density * len(inside) * field.spacing**3
-    return centre.numpy(), WEIGHT.gravity * max(mass, WEIGHT.mass)
+    return centre.numpy(), GRAVITY * max(mass, WEIGHT.mass)
 
 
 def _limited(vector: np.ndarray, most: float) -> np.ndarray:

@@ -26,7 +26,7 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.press import PressPostures, press_postures
 from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.scene.occupancy import OCCUPANCY
-from torchgrasp.success.task import TASKS
+from torchgrasp.values.specs import GRAVITY
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,7 +174,7 @@ def find_drag(
     if not len(corners):
         return no_posture
     # the torque of the weight's friction, over the friction that is left to two tips
-    lever = 2 * table_friction * mass * TASKS.gravity / (DRAG.share * friction * force)
+    lever = 2 * table_friction * mass * GRAVITY / (DRAG.share * friction * force)
     postures = press_postures(hand)
     hand = hand.to("cpu", torch.float64)
     search = _PressSearch(object_, hand, postures, balance, _Top(corners), force, lever)
@@ -251,7 +251,7 @@ def pressing_force(mass: float, friction: float, table_friction: float) -> float
     A force N moves it if m N >= t (N + W). Here m and t are the frictions of fingers and table, and
     W is the weight.
     """
-    weight = mass * TASKS.gravity
+    weight = mass * GRAVITY
     least = table_friction * weight / (friction - table_friction)
     if DRAG.enough * least > DRAG.most:
         return None

@@ -29,10 +29,10 @@ from torchgrasp.planner.objects import ShapedObject
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.run import plan_shaped
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.success.task import TASKS, GraspTask, TaskWrenches
+from torchgrasp.success.task import GraspTask, TaskWrenches
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
-from torchgrasp.values.specs import ContactSpec
+from torchgrasp.values.specs import GRAVITY, ContactSpec
 
 
 @checked
@@ -182,7 +182,7 @@ def _weight(mass: float, table: Plane, centre: Float[Tensor, "3"]) -> TaskWrench
 
     The hand grasps the object beside its centre of mass, so that its weight would turn it.
     """
-    force = -DRAG.carried * mass * TASKS.gravity * table.normal.double()
+    force = -DRAG.carried * mass * GRAVITY * table.normal.double()
     return TaskWrenches(torch.cat([force, torch.zeros_like(force)])[None], centre)
 
 

@@ -18,6 +18,7 @@ from torchgrasp.foundation.rules import Positive
 from torchgrasp.geometry.plane import UNIT_ERROR, Plane
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Urdf, read_urdf
+from torchgrasp.values.specs import GRAVITY
 
 # inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need it
 ARMATURE = 1e-3
@@ -150,7 +151,7 @@ class SceneSpec:
     parts: "list[trimesh.Trimesh]"
     mass: float
     friction: float = 0.8
-    gravity: float = 9.81
+    gravity: float = GRAVITY
     timestep: float = 1 / 500
     travel: float = 0.1
     approach: tuple[float, float, float] = (0.0, 0.0, 0.0)

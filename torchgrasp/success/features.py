@@ -21,7 +21,7 @@ from torchgrasp.success.loads import carrying_force, greatest_force, strength_of
 from torchgrasp.success.moved import touch_moved
 from torchgrasp.success.task import Conditions, GraspTask
 from torchgrasp.values.planning import Contacts, Grasps
-from torchgrasp.values.specs import ContactSpec
+from torchgrasp.values.specs import GRAVITY, ContactSpec
 
 CAUSES: dict[str, dict[str, str]] = {
     "load": {"force needed": "N", "force to spare": "1", "offset": "m"},
@@ -65,8 +65,6 @@ class FeatureNumbers:
 
     slippery: float = 0.5
     """Share of the friction coefficient that a slippery object has."""
-    gravity: float = 9.81
-    """Acceleration [m/s2] of a lifted load."""
     pull: float = 10.0
     """Acceleration [m/s2] of a pull."""
     least_force: float = 1e-3
@@ -162,7 +160,7 @@ def weight_about(
     """
     arm = center - points.mean(1)
     force = torch.zeros_like(arm)
-    force[:, 2] = -MEASURES.gravity * mass
+    force[:, 2] = -GRAVITY * mass
     return torch.cat([force, torch.linalg.cross(arm, force)], -1)
 
 
@@ -207,7 +205,7 @@ def _force_for(
     The load is the weight of the mass if the object is `lifted`, and otherwise a pull in any
     direction.
     """
-    weight = MEASURES.gravity * masses[0] if lifted else 0.0
+    weight = GRAVITY * masses[0] if lifted else 0.0
     pull = 0.0 if lifted else MEASURES.pull * masses[0]
     load = center.new_tensor([0.0, 0.0, -weight])
     force = carrying_force(contacts, forces, center, frictions, load, pull)

@@ -18,7 +18,7 @@ from torchgrasp.geometry.frames import apply, real, rotate
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.distribution import Distribution, check_within
-from torchgrasp.values.specs import MASSES
+from torchgrasp.values.specs import GRAVITY, MASSES
 
 
 @checked
@@ -190,8 +190,6 @@ class TaskWrenches(Value):
 class TaskNumbers:
     """Loads of the named tasks, and the directions of pushes."""
 
-    gravity: float = 9.81
-    """Acceleration [m/s2] of a load."""
     push: float = 2.5
     """Force [N] of a push."""
     around: float = 1.24
@@ -257,11 +255,11 @@ def _named_loads(mass: float) -> dict[str, Float[Tensor, "w 3"]]:
     corners = torch.tensor(signs, dtype=torch.float32) / math.sqrt(3)
     # The convex hull of these vectors contains the unit ball.
     around = TASKS.around * torch.cat([corners, axes, -axes])  # (14, 3)
-    weight = real([[0.0, 0.0, -TASKS.gravity * mass]])
+    weight = real([[0.0, 0.0, -GRAVITY * mass]])
     # Without the vector that points up, the hull contains the part of the ball within 120 degrees
     # of straight down.
     return {
         "lift": weight,
-        "pour": TASKS.gravity * mass * around[around[:, 2] < TASKS.upward],
+        "pour": GRAVITY * mass * around[around[:, 2] < TASKS.upward],
         "push": weight + TASKS.push * around,
     }

@@ -15,6 +15,8 @@ from torchgrasp.values.distribution import Distribution, check_within
 
 Simulator = Literal["sapien", "mujoco"]
 """The simulators."""
+GRAVITY = 9.81
+"""Acceleration [m/s^2] by gravity."""
 RIM = 0.001  # radius [m] that is flat on a rim
 PAPER_RADIUS = 0.1  # the paper's radius of starts, normalised
 ROUNDING = 1e-9  # relative error of a period
@@ -369,7 +371,7 @@ class TrialSpec(Value):
     holding: HoldingMode | None = None
     mass: Annotated[float, MASSES] | Distribution = 0.1
     friction: Annotated[float, FRICTIONS] | Distribution = 0.8
-    gravity: Annotated[float, Range(0.0, 100.0)] = 9.81
+    gravity: Annotated[float, Range(0.0, 100.0)] = GRAVITY
     approach: Annotated[float, Range(0.0, 1.0)] = 0.1
     lift_height: Annotated[float, Range(0.0, 1.0)] = 0.1
     hold_time: Annotated[float, Range(0.0, 60.0)] = 2.0
