@@ -15,7 +15,7 @@ from torchgrasp.cloud.viewpoint import GUESS, UNSEEN, is_along_z, share_unseen
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.linalg import Points, Vector, unit
+from torchgrasp.geometry.linalg import Points, Vector, norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
 
@@ -152,9 +152,9 @@ def _judge_backward(
     elsewhere = viewpoint is not None and bool(viewpoint.any())
     if elsewhere or float(up[2]) <= ADVICE.z_up:
         return None
-    away = torch.linalg.vector_norm(points, dim=-1)
-    radius = torch.linalg.vector_norm(points - points.mean(0), dim=-1).max()
-    far = bool(torch.linalg.vector_norm(points.mean(0)) > GUESS.far * radius)
+    away = norm(points)
+    radius = norm(points - points.mean(0)).max()
+    far = bool(norm(points.mean(0)) > GUESS.far * radius)
     least = math.cos(math.radians(GUESS.half_view))
     if not far or not bool((-points[:, 2] > least * away).all()):
         return None

@@ -245,12 +245,12 @@ def distance_behind(points: Points, cloud: PointCloud) -> Float[Tensor, "n"]:
     """
     rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
     seen = cloud.points[rows].double().cpu()
-    length = float(torch.linalg.vector_norm(seen.amax(0) - seen.amin(0)))
+    length = float(norm(seen.amax(0) - seen.amin(0)))
     away = points[:, None] - seen  # (n, m, 3)
     # Without a camera, the space around the cloud counts as hidden.
     if cloud.viewpoint is None:
-        return (torch.linalg.vector_norm(away, dim=-1).amin(1) - length / 2).clamp_min(0)
+        return (norm(away).amin(1) - length / 2).clamp_min(0)
     eye = cloud.viewpoint.double().cpu()
     ray = unit(seen - (eye if eye.ndim == 1 else eye[rows]))
     behind = (away * ray).sum(-1, keepdim=True).clamp(0, length)
-    return torch.linalg.vector_norm(away - behind * ray, dim=-1).amin(1)
+    return norm(away - behind * ray).amin(1)

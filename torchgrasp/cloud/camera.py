@@ -18,6 +18,7 @@ from torchgrasp.foundation.errors import MeshError
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import with_true_normals
 from torchgrasp.values.planning import PointCloud
 
@@ -259,6 +260,6 @@ def _cast_table(height: float, obj_from_camera: Transform) -> tuple[Image, Image
     origin = obj_from_camera[:3, 3]
     depth = (height - origin[2]) / direction[..., 2]
     where = origin[:2] + depth[..., None] * direction[..., :2]
-    met = (depth > 0) & (torch.linalg.vector_norm(where, dim=-1) < RENDER.table)
-    cosine = direction[..., 2].abs() / torch.linalg.vector_norm(direction, dim=-1)
+    met = (depth > 0) & (norm(where) < RENDER.table)
+    cosine = direction[..., 2].abs() / norm(direction)
     return torch.where(met, depth, 0.0), torch.where(met, cosine, 0.0)

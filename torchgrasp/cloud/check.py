@@ -15,7 +15,7 @@ from torchgrasp.foundation.errors import BadArgument, SuspiciousScale, TooFewPoi
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.linalg import Points, number_rows
+from torchgrasp.geometry.linalg import Points, norm, number_rows
 from torchgrasp.values.planning import PointCloud
 
 MIN_POINTS = 4  # fewest distinct points from which a surface can be estimated
@@ -103,7 +103,7 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
     place = (points - points.amin(0)) / voxel
     cell = torch.floor(place)
     group = number_rows(cell)
-    order = torch.argsort(torch.linalg.vector_norm(place - cell - 0.5, dim=-1), stable=True)
+    order = torch.argsort(norm(place - cell - 0.5), stable=True)
     rows = order[first_of_each(group[order])].sort().values
     if len(rows) < MIN_POINTS:
         found = f"{len(rows)} voxels of {voxel:g} m"
@@ -154,12 +154,12 @@ def _check(cloud: PointCloud) -> Points:
         found = f"{extent:.4g} m; is this cloud {_guess_unit(extent)}?"
         raise SuspiciousScale("points", found, allowed)
     if cloud.normals is not None:
-        zero = int((torch.linalg.vector_norm(cloud.normals, dim=-1) == 0).sum())
+        zero = int((norm(cloud.normals) == 0).sum())
         if zero:
             found = f"{zero} normals of length zero"
             raise BadArgument("normals", found, "normals with a direction")
     if cloud.viewpoint is not None:
-        away = float(torch.linalg.vector_norm(cloud.viewpoint - points, dim=-1).max())
+        away = float(norm(cloud.viewpoint - points).max())
         if away > CLOUD.farthest:
             allowed = f"a camera within {CLOUD.farthest:g} m of the points, in metres as they are"
             raise BadArgument("viewpoint", f"one {away:.4g} m away", allowed)

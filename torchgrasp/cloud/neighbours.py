@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.linalg import Points, unit
+from torchgrasp.geometry.linalg import Points, dot, matvec, norm, unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +135,7 @@ def _fit_block(
     """
     _, axes = _principal_axes(near, weight)
     height, u, v = ((near - points[:, None]) @ axes).unbind(-1)  # (m, k) each
-    size = torch.stack([u, v], -1).norm(dim=-1).amax(-1, keepdim=True)
+    size = norm(torch.stack([u, v], -1)).amax(-1, keepdim=True)
     u = u / size
     v = v / size
     terms = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1)
@@ -143,11 +143,11 @@ def _fit_block(
     flat = NEAR.ridge * torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]).to(points)
     moments = weighted.transpose(-1, -2) @ terms + torch.diag_embed(flat)
     quadric = torch.linalg.solve(moments, (weighted * height[..., None]).sum(-2))  # (m, 6)
-    residual = height - (terms * quadric[:, None]).sum(-1)
+    residual = height - dot(terms, quadric[:, None])
     # The surface is where height - quadric is 0: its gradient there is the normal.
     slope = -quadric[:, 1:3] / size
     gradient = torch.cat([torch.ones_like(size), slope], -1)
-    normals = unit((axes @ gradient[..., None])[..., 0])
+    normals = unit(matvec(axes, gradient))
     feet = points + quadric[:, :1] * axes[..., 0]
     return feet, normals, (weight * residual**2).sum(-1).sqrt()
 

@@ -14,7 +14,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import NoSupport, TooFewPoints
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.linalg import Points, Vector, number_components
+from torchgrasp.geometry.linalg import Points, Vector, norm, number_components
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SUPPORTS, SupportPlane
 from torchgrasp.geometry.support_search import find_supports
@@ -134,7 +134,7 @@ def cut_object(
     if box is not None:
         keep &= ((points >= box.amin(0)) & (points <= box.amax(0))).all(1)
     if point is not None:
-        keep &= torch.linalg.vector_norm(points - point, dim=-1) < PARTS.around
+        keep &= norm(points - point) < PARTS.around
     cloud = _select(cloud, keep, "points in the box and near the point")
     support = find_ground(cloud.points, cloud.viewpoint, up)
     if support is not None:
@@ -145,7 +145,7 @@ def cut_object(
     points = cloud.points.double()
     label = label_bodies(points, gap)
     if point is not None:
-        wanted = int(label[torch.linalg.vector_norm(points - point, dim=-1).argmin()])
+        wanted = int(label[norm(points - point).argmin()])
     else:
         over = label if support is None else label[support.covers(points)]
         wanted = int((over if len(over) else label).mode().values)

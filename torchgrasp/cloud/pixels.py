@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows, fit_local_planes, nearest
-from torchgrasp.geometry.linalg import Points, Vector, across, fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import Points, Vector, across, fibonacci_sphere, matvec, norm, unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +110,7 @@ def irregularity(
         ray = unit(probes - some[:, None])  # (b, m, 3)
         other = unit(near - some[:, None, None])  # (b, m, k, 3)
         # the square of the chord, which is an angle where it is small
-        apart = 2 - 2 * (other @ ray[..., None])[..., 0]
+        apart = 2 - 2 * matvec(other, ray)
         angle = apart.clamp_min(0.0).amin(-1).sqrt()
         usual = angle.median(1, keepdim=True).values
         found.append(((angle - usual).abs() / usual).mean(1))
@@ -132,7 +132,7 @@ def _refine(
     score = eyes.new_zeros(len(eyes))
     for _ in range(PIXELS.steps):
         away = eyes - centre
-        distance = torch.linalg.vector_norm(away, dim=-1)
+        distance = norm(away)
         forward = away / distance[:, None]
         aside = torch.stack(across(forward), 1)  # (s, 2, 3)
         turned = forward[:, None] + PIXELS.turn * width * (grid[:, :2] @ aside)  # (s, 27, 3)

@@ -21,7 +21,7 @@ from torchgrasp.foundation.errors import BadArgument, MendedInput, NoSupport
 from torchgrasp.foundation.limits import SHOWN_LETTERS
 from torchgrasp.foundation.rules import RIGID, is_rigid, nearest_rotation
 from torchgrasp.foundation.told import warn_user
-from torchgrasp.geometry.linalg import Points, Vector, unit
+from torchgrasp.geometry.linalg import Points, Vector, norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import PLANES
 from torchgrasp.geometry.support_planes import SupportPlane
@@ -218,7 +218,7 @@ def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
         found = repr(pose)[:SHOWN_LETTERS]
         raise BadArgument("camera_pose", found, "a 4 x 4 matrix of numbers") from error
     read = check_rigid("camera_pose", read)
-    distance = float(torch.linalg.vector_norm(read[:3, 3]))
+    distance = float(norm(read[:3, 3]))
     _check_distance(read, distance, POSE.farthest, "the camera")
     return read
 
@@ -228,7 +228,7 @@ def tell_far(pose: Transform) -> tuple[str, ...]:
 
     Its pose may then be in cm.
     """
-    distance = float(torch.linalg.vector_norm(pose[:3, 3]))
+    distance = float(norm(pose[:3, 3]))
     if distance <= POSE.farthest_table:
         return ()
     fix = "if camera_pose is in cm, divide camera_pose[:3, 3] by 100"
@@ -341,7 +341,7 @@ def _is_own(pose: Transform) -> bool:
     not be up.
     """
     turn = float(torch.diagonal(pose[:3, :3]).min())
-    return turn > POSE.turn and float(torch.linalg.vector_norm(pose[:3, 3])) < POSE.shift
+    return turn > POSE.turn and float(norm(pose[:3, 3])) < POSE.shift
 
 
 def _check_supports(

@@ -20,7 +20,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, CloudWarning, NoEffect, TooFewPoints
 from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.geometry.linalg import Points, Vector, unit, unit_of_any
+from torchgrasp.geometry.linalg import Points, Vector, dot, norm, unit, unit_of_any
 from torchgrasp.values.planning import PointCloud
 
 FACING = 0.9  # least share of a view's normals that face the camera; noise turns some at the rim
@@ -231,7 +231,7 @@ def _fit_normals(cloud: PointCloud, clean: bool, up: Vector | None = None) -> Po
     points = cloud.points
     feet, normals, rms = fit_quadrics(points.double())
     if clean:
-        offset = torch.linalg.vector_norm(points.double() - feet, dim=-1)
+        offset = norm(points.double() - feet)
         keep = offset <= PREPARE.moved * rms.median() + PREPARE.least
         cloud = cloud.select(keep)
         points = feet.to(points.dtype)[keep]
@@ -256,13 +256,13 @@ def compare_normals(points: Points, normals: Points) -> NormalCheck:
     distance, index = nearest(points, NORMALS.neighbours)
     others = index[:, 1:]  # (n, 8)
     directions = unit(normals)
-    cosine = (directions[:, None] * directions[others]).sum(-1)
+    cosine = dot(directions[:, None], directions[others])
     height = ((points[others] - points[:, None]) * directions[:, None]).sum(-1).abs()
     compared = (cosine.abs() > NORMALS.edge) & (height <= NORMALS.over * distance[:, 1:])
     against = compared & (cosine < 0)
     pairs = int(compared.sum())
     opposed = int(against.sum()) / pairs if pairs >= NORMALS.pairs else 0.0
-    error = (torch.linalg.vector_norm(normals, dim=-1) - 1).abs()
+    error = (norm(normals) - 1).abs()
     return NormalCheck(
         flipped=2 * against.sum(-1) > compared.sum(-1),
         opposed=opposed,
@@ -280,7 +280,7 @@ def point_inward(points: Points, normals: Points) -> bool:
     """
     away = points - points.mean(0)
     outward = float((away * unit_of_any(normals)).sum())
-    return outward < -NORMALS.inward * float(torch.linalg.vector_norm(away, dim=-1).sum())
+    return outward < -NORMALS.inward * float(norm(away).sum())
 
 
 def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*views 3"]) -> float:

@@ -19,7 +19,7 @@ from torchgrasp.cloud.safe_files import parse_npy, parse_npz, unread_arrays
 from torchgrasp.cloud.viewpoint import can_see, is_along_z
 from torchgrasp.files import explain, read_bounded, write_file
 from torchgrasp.files.columns import find_columns, parse_text
-from torchgrasp.foundation.base import Value, named_tensors
+from torchgrasp.foundation.base import Value, flatnonzero, named_tensors
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument, CloudFileError, TooFewPoints
 from torchgrasp.foundation.limits import CLOUD_BYTES, CLOUD_POINTS
@@ -447,7 +447,7 @@ def _find_repeated(points: Tensor, keep: Tensor, notes: list[str]) -> Tensor:
     with the other points, or (-1, -1, -1).
     """
     none = torch.zeros_like(keep)
-    rows = torch.nonzero(keep)[:, 0]
+    rows = flatnonzero(keep)
     some = points[rows[:: 1 + len(rows) // READ.searched]]
     if len(some) < READ.fewest:
         return none

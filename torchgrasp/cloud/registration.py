@@ -26,7 +26,7 @@ from torchgrasp.foundation.errors import BadArgument, MendedInput
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import rotation_angle, rotation_from_vector, turned_about
-from torchgrasp.geometry.linalg import Points, Vector, norm, unit
+from torchgrasp.geometry.linalg import Points, Vector, dot, norm, unit
 from torchgrasp.values.planning import PointCloud
 
 
@@ -293,7 +293,7 @@ class _ViewSurface:
         own = self.normals[row]
         height = ((points - self.points[row]) * own).sum(-1)
         beside = (distance.square() - height.square()).clamp_min(0).sqrt()
-        matched = (normals * own).sum(-1) > VIEWS.same
+        matched = dot(normals, own) > VIEWS.same
         matched = matched & (beside < VIEWS.reach * self.spacing) & (height.abs() < most)
         return matched, height, own
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgrasp.cloud.neighbours import draw_rows, nearest
 from torchgrasp.foundation.errors import NoSupport
 from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.linalg import Points, Vector, fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import Points, Vector, dot, fibonacci_sphere, norm, unit
 from torchgrasp.geometry.support_search import find_supports
 
 
@@ -131,14 +131,14 @@ def _draw(points: Points, normals: Points) -> tuple[Float[Tensor, "m 3"], Float[
 def is_along_z(points: Points) -> bool:
     """Return whether a camera in the origin that looks along z has the points (n, 3) [m] ahead."""
     middle = points.mean(0)
-    return float(middle[2]) > GUESS.ahead * float(torch.linalg.vector_norm(middle))
+    return float(middle[2]) > GUESS.ahead * float(norm(middle))
 
 
 def _is_ahead(points: Points, centre: Vector, radius: Float[Tensor, ""]) -> bool:
     """Return whether points lie before a camera in the origin that looks along z."""
     least = math.cos(math.radians(GUESS.half_view))
-    in_front = points[:, 2] > least * torch.linalg.vector_norm(points, dim=-1)
-    far = torch.linalg.vector_norm(centre) > GUESS.far * radius
+    in_front = points[:, 2] > least * norm(points)
+    far = norm(centre) > GUESS.far * radius
     return bool(far) and bool(in_front.all())
 
 
@@ -174,7 +174,7 @@ def _enclose(points: Points) -> tuple[Vector, Float[Tensor, ""]]:
     axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh
     along = points @ axes.T
     centre = (along.amax(0) + along.amin(0)) / 2 @ axes
-    return centre, torch.linalg.vector_norm(points - centre, dim=-1).max()
+    return centre, norm(points - centre).max()
 
 
 def _explain(
@@ -187,8 +187,8 @@ def _explain(
     distance, over the cosine between ray and normal.
     """
     away = viewpoints - points[:, None]  # (n, k, 3)
-    distance = torch.linalg.vector_norm(away, dim=-1).clamp_min(GUESS.least)
-    cosine = (away * normals[:, None]).sum(-1) / distance  # (n, k)
+    distance = norm(away).clamp_min(GUESS.least)
+    cosine = dot(away, normals[:, None]) / distance  # (n, k)
     bulge = (normals * (points - _enclose(points)[0])).sum(-1)
     towards = (bulge[:, None] * torch.tanh(cosine / GUESS.tangent)).sum(0)
     bulging = towards / bulge.abs().sum().clamp_min(GUESS.least)
@@ -211,7 +211,7 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
     """
     points, normals, viewpoint = (x.cpu() for x in (points, normals, viewpoint))
     ray = unit(points - viewpoint)
-    edge_on = float(((ray * normals).sum(-1).abs() < UNSEEN.grazing).double().mean())
+    edge_on = float((dot(ray, normals).abs() < UNSEEN.grazing).double().mean())
     middle = (points.amax(0) + points.amin(0)) / 2
     forward = middle - viewpoint
     if not bool(forward.any()) or bool(((points - viewpoint) @ forward <= 0).any()):
@@ -225,5 +225,5 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
     # A point lies behind a neighbour if it is deeper by more than a slope explains.
     step = (depth[:, None] - depth[torch.from_numpy(index)]).abs()
     step = step - UNSEEN.slope * torch.from_numpy(apart).to(depth) * depth[:, None]
-    radius = torch.linalg.vector_norm(points - middle, dim=-1).max()
+    radius = norm(points - middle).max()
     return edge_on, float((step.amax(1) > UNSEEN.step * radius).double().mean())

@@ -20,7 +20,7 @@ from torchgrasp.control.least_forces import Balance, LeastForces, balance, frict
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation, smooth
 from torchgrasp.foundation.errors import Status
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.linalg import dot, norm
 from torchgrasp.hand.drives import drive_efforts
 from torchgrasp.values.distribution import Distribution
 
@@ -149,7 +149,7 @@ def held_forces(
     sensed = observation.tactile
     placed = torch.isfinite(sensed.points) & torch.isfinite(sensed.normals)
     if bool(placed.all()):
-        push = -(forces * normals).sum(-1)
+        push = -dot(forces, normals)
         preferred = push[None] if gains.force_source == "stability" else None
         balanced = least_friction_forces(
             sensed.points[None], sensed.normals[None], float(push.max()), preferred
@@ -157,7 +157,7 @@ def held_forces(
         if bool(torch.isfinite(balanced).all()):
             forces = balanced
             normals = sensed.normals
-    pushes = (forces * normals).sum(-1) * reference.alive
+    pushes = dot(forces, normals) * reference.alive
     return forces, float(-pushes.sum())
 
 

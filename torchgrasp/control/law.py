@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.geometry.linalg import cholesky, limit_norm, norm, squared_mahalanobis
+from torchgrasp.geometry.linalg import cholesky, dot, limit_norm, norm, squared_mahalanobis
 
 POSITION_FLOOR = 0.005
 """Standard deviation [m], in all directions, of errors of hand pose and joint zeros; it keeps Eq.
@@ -67,7 +67,7 @@ def force_covariance(
     `deviation` [N] is the standard deviation of each normal force; None means a tenth of the force.
     """
     if deviation is None:
-        deviation = FORCE_SHARE * (forces * normals).sum(-1)
+        deviation = FORCE_SHARE * dot(forces, normals)
     return _normal_covariance(normals, deviation, FORCE_FLOOR)
 
 

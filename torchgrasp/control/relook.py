@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import rotation_from_vector, turned_about
-from torchgrasp.geometry.linalg import across, unit
+from torchgrasp.geometry.linalg import across, matvec, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.values.planning import PointCloud
@@ -116,5 +116,5 @@ class _Registration:
         rows = -torch.cat([gradient @ along.mT, turning], -1)  # (m, n, 3)
         weighted = rows / (RELOOK.scale**2 + distance.square())[..., None]
         matrix = weighted.mT @ rows + torch.diag(std**-2)
-        value = (weighted.mT @ distance[..., None])[..., 0]
+        value = matvec(weighted.mT, distance)
         return torch.linalg.solve(matrix, -value - motions / std**2).clamp(-longest, longest)

@@ -29,6 +29,7 @@ from torchgrasp.foundation.base import map_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Positive
+from torchgrasp.geometry.linalg import dot, norm
 
 WAITING_FORCE = 0.3
 """Largest force [N] of a finger that waits until the others touch; also the reading [N] of a binary
@@ -101,7 +102,7 @@ def feel_torques(
     forces_by = _forces_by_torques(reference, jacobian)
     radius = reference.hand.tips.radius
     forces = forces_by @ torques
-    push = -(forces * reference.normals).sum(-1)
+    push = -dot(forces, reference.normals)
     nowhere = torch.full_like(forces, torch.nan)
     pushes = TipContact(push.clamp_min(0.0), forces, nowhere, nowhere)
     sensed = measure(tactile, pushes, reference.normals, radius, period)
@@ -109,7 +110,7 @@ def feel_torques(
         return sensed
     # thresholds of flags grow where torques tell a force less surely than a tactile fingertip
     along = torch.einsum("fc,fcj->fj", reference.normals, forces_by)
-    factor = along.norm(dim=-1) * TORQUE_NOISE / NOISE
+    factor = norm(along) * TORQUE_NOISE / NOISE
     factor = (factor * reference.sensor.noise).clamp_min(1.0)
     return dataclasses.replace(sensed, contact=flag(tactile.contact, sensed.average, factor))
 
@@ -155,7 +156,7 @@ class DriveFeel:
         torques = self.reference.kp * (targets - joints) - damped
         self.before = joints
         forces = _forces_by_torques(self.reference, observation.jacobian) @ torques
-        pushes = -(forces * self.reference.normals).sum(-1)
+        pushes = -dot(forces, self.reference.normals)
         self.pushes = smooth(self.pushes, pushes, FLAG_CUTOFF, period)
         return self.pushes
 

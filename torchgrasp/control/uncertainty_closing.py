@@ -22,7 +22,7 @@ from torchgrasp.control.protocol import SETTLED, Settled, strongest_lead
 from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.sensing import WAITING_FORCE, DriveFeel
 from torchgrasp.control.tactile import STILL, Observation
-from torchgrasp.geometry.linalg import limit_norm
+from torchgrasp.geometry.linalg import dot, limit_norm
 from torchgrasp.values.closing import ClosingOptions
 
 PALM_SPEED = 0.04  # largest speed [m/s] of the palm that follows the object
@@ -159,7 +159,7 @@ class UncertaintyClosing:
         planned, drift = self._follow(points, contact)
         error = planned - points
         # how far [m] each planned contact still lies ahead of its fingertip: (f,)
-        ahead = -(error * normals).sum(-1)
+        ahead = -dot(error, normals)
         touches, rests = self._without_sensor(observation, ahead, contact, period)
         contact = contact | touches
         if self.waits:
@@ -285,7 +285,7 @@ class UncertaintyClosing:
         """Return the desired normal force [N] of each finger; if the sensor is dead, the force
         error is zero.
         """
-        desired = -(self.reference.gains.desired_force * self.reference.normals).sum(-1)
+        desired = -dot(self.reference.gains.desired_force, self.reference.normals)
         if self.waits:
             rest = WAITING_FORCE if bool(contact.all()) else reading.clamp_max(WAITING_FORCE)
             desired = torch.where(contact, rest, desired)

@@ -14,7 +14,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.foundation.rules import ANY, Length
 from torchgrasp.geometry.frames import apply
-from torchgrasp.geometry.linalg import Points, norm
+from torchgrasp.geometry.linalg import Points, dot, norm
 from torchgrasp.geometry.mesh_distance import surface_distance
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps, PointCloud
@@ -148,7 +148,7 @@ def _heights(points: Points, cloud: PointCloud, limit: float) -> Float[Tensor, "
     normals = cloud.normals.detach().double().cpu()
     row = torch.from_numpy(spatial.KDTree(seen.numpy()).query(points.numpy())[1])
     away = points - seen[row]
-    height = (away * normals[row]).sum(-1)
+    height = dot(away, normals[row])
     beside = norm(away - height[:, None] * normals[row])
     shown = beside <= TOUCH.reach * usual_spacing(seen)
     if cloud.viewpoint is not None:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.linalg import Points, Vector, norm, number_rows, unit
+from torchgrasp.geometry.linalg import Points, Vector, dot, norm, number_rows, unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -287,7 +287,7 @@ def _propose(
     height = double_area / longest.clamp_min(PLANES.least_side)
     wide = height > PLANES.least_height * view.noise.median()
     normal = normal[wide] / double_area[wide, None]
-    offset = (normal * a[wide]).sum(-1)
+    offset = dot(normal, a[wide])
     if view.sky is not None:
         tilt = math.radians(PLANES.most_tilt + PLANES.tilt_slack)
         upright = (normal @ view.sky).abs() > math.cos(tilt)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument, NoSupport
-from torchgrasp.geometry.linalg import Points, Vector, number_rows, unit
+from torchgrasp.geometry.linalg import Points, Vector, norm, number_rows, unit
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.plane_fit import (
     PLANES,
@@ -126,8 +126,8 @@ def _support_near(
     A bowed or soft support has such a plane, although no plane holds its whole surface.
     """
     middle = target.points.mean(0)
-    radius = float((target.points - middle).norm(dim=-1).quantile(1 - SUPPORTS.outliers))
-    points = points[(points - middle).norm(dim=-1) < radius + SUPPORTS.near]
+    radius = float(norm(target.points - middle).quantile(1 - SUPPORTS.outliers))
+    points = points[norm(points - middle) < radius + SUPPORTS.near]
     generator = torch.Generator().manual_seed(0)
     drawn = torch.randperm(len(points), generator=generator, device="cpu")[: SUPPORTS.points]
     if len(drawn) < SUPPORTS.least_points:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Value, flatnonzero, row_numbers
 from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
-from torchgrasp.geometry.linalg import eye_like
+from torchgrasp.geometry.linalg import dot, eye_like, matvec
 from torchgrasp.posture_model.gaussian import whitening_matrices
 
 
@@ -260,13 +260,13 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
     d = means.shape[1]
     whitening = whitening_matrices(components.covariances)
     precision = whitening.mT @ whitening
-    linear = (precision @ means[..., None])[..., 0]
+    linear = matvec(precision, means)
     log_scale = whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     constant = (
         components.weights.log()
         - 0.5 * d * math.log(2 * math.pi)
         + log_scale
-        - 0.5 * (linear * means).sum(-1)
+        - 0.5 * dot(linear, means)
     )
     i, j = torch.triu_indices(d, d, device=means.device)
     # A mixed product occurs twice in the square.

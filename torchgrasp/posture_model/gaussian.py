@@ -17,7 +17,7 @@ from torchgrasp.foundation.base import Kept, Value, kept
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, Seed, check_dense, is_known
-from torchgrasp.geometry.linalg import cholesky, eye_like
+from torchgrasp.geometry.linalg import cholesky, dot, eye_like, matvec
 
 PARAMETERS = ("weights", "means", "covariances")
 # points evaluated together: bounds the memory of points x components x dimensions
@@ -239,7 +239,7 @@ class GaussianMixture(Value):
         matrix = whitening_matrices(self.covariances.double())
         spread = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         log_scale = spread - 0.5 * d * math.log(2 * math.pi)
-        return Whitening(matrix, (matrix @ means[..., None])[..., 0], log_scale)
+        return Whitening(matrix, matvec(matrix, means), log_scale)
 
     def _index(self, names: Sequence[str]) -> list[int]:
         unknown = [name for name in names if name not in self.names]
@@ -263,7 +263,7 @@ class Whitening:
         """
         m, d = self.means.shape
         whitened = (x @ self.matrix.reshape(m * d, d).T).reshape(-1, m, d) - self.means
-        return (whitened * whitened).sum(-1)
+        return dot(whitened, whitened)
 
 
 def map_rows(

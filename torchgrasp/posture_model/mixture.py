@@ -21,7 +21,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.rules import ANY, Count, is_known
 from torchgrasp.geometry.frames import degenerate, real, virtual_frame
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.linalg import dot, norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand
 from torchgrasp.posture_model.gaussian import PARAMETERS, GaussianMixture, map_rows, of_parameters
@@ -56,7 +56,7 @@ def encode_fingertips(
     """
     lengths = norm(points - points.mean(-2, keepdim=True))
     pairs = itertools.combinations(normals.unbind(-2), 2)
-    cosines = torch.stack([(n * m).sum(-1) for n, m in pairs], dim=-1)
+    cosines = torch.stack([dot(n, m) for n, m in pairs], dim=-1)
     return torch.cat([lengths, cosines], dim=-1)
 
 

@@ -22,7 +22,7 @@ from torchgrasp.foundation.base import Batch, Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, Seed
-from torchgrasp.geometry.linalg import across, fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import across, dot, fibonacci_sphere, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips
 from torchgrasp.values.specs import ContactSpec
@@ -81,8 +81,8 @@ def _close_triples(
     closed = torch.ones(len(points), BALANCES, dtype=torch.bool, device=points.device)
     pulls = ((e12, e13, t12, t13), (-e12, e23, t12, t23), (-e13, -e23, t13, t23))
     for inward, (a, b, ta, tb) in zip(normals.unbind(1), pulls, strict=True):
-        into = (a * inward).sum(-1)[:, None] * ta + (b * inward).sum(-1)[:, None] * tb
-        squared = ta**2 + tb**2 + 2 * (a * b).sum(-1)[:, None] * (ta * tb)
+        into = dot(a, inward)[:, None] * ta + dot(b, inward)[:, None] * tb
+        squared = ta**2 + tb**2 + 2 * dot(a, b)[:, None] * (ta * tb)
         closed = closed & (into > 0) & (squared <= spread * into**2)
     return closed.any(1)
 

@@ -24,7 +24,7 @@ from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.foundation.limits import CLOUD_BYTES
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
-from torchgrasp.geometry.linalg import Points, Vector, unit
+from torchgrasp.geometry.linalg import Points, Vector, norm, unit
 from torchgrasp.geometry.plane import FINE
 
 
@@ -274,8 +274,8 @@ def image_of_cloud(
     forward = unit(unit(points - viewpoint).mean(0))
     down = -up + (up @ forward) * forward
     # straight from above, any direction will do
-    if float(torch.linalg.vector_norm(down)) < PROJECTION.steep:
-        side = points[(points - points.mean(0)).norm(dim=-1).argmax()] - viewpoint
+    if float(norm(down)) < PROJECTION.steep:
+        side = points[norm(points - points.mean(0)).argmax()] - viewpoint
         down = side - (side @ forward) * forward
     down = unit(down)
     pose = rigid(torch.stack([torch.linalg.cross(down, forward), down, forward], -1), viewpoint)
@@ -284,7 +284,7 @@ def image_of_cloud(
     flat = camera[:, :2] / camera[:, 2:]
     widest = math.tan(math.radians(PROJECTION.widest))
     ahead = bool((camera[:, 2] > 0).all())
-    if not ahead or float(flat.norm(dim=-1).max()) > widest:
+    if not ahead or float(norm(flat).max()) > widest:
         allowed = f"a view within {PROJECTION.widest:g} degrees of its middle"
         raise BadArgument("cloud", "points all around the camera", allowed)
     low = flat.amin(0)

@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.parts import label_bodies
+from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.frames import inverse, rotate
-from torchgrasp.geometry.linalg import across, unit
+from torchgrasp.geometry.linalg import across, norm, unit
 from torchgrasp.geometry.support_planes import Hull
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.table_image import TableImage
@@ -309,7 +310,7 @@ def _floating(view: TableImage, pieces: Int[Tensor, "h w"]) -> Bool[Tensor, "k"]
     floating = torch.zeros(int(pieces.max()) + 1, dtype=torch.bool)
     normal = view.support.plane.normal.double()
     down = -rotate(inverse(image.obj_from_camera), normal[None])[0, :2]
-    if float(torch.linalg.vector_norm(down)) < MERGE.from_above:
+    if float(norm(down)) < MERGE.from_above:
         return floating
     column, row = torch.round(MERGE.below * unit(down)).long().tolist()
     below = torch.roll(pieces, (-row, -column), (0, 1))
@@ -320,7 +321,7 @@ def _floating(view: TableImage, pieces: Int[Tensor, "h w"]) -> Bool[Tensor, "k"]
     count = torch.bincount(pieces[free], minlength=len(floating))
     whole = count + torch.bincount(pieces[hidden], minlength=len(floating))
     some = (count >= MERGE.touching) & (count >= MERGE.seen * whole)
-    for k in torch.nonzero(some)[:, 0].tolist():
+    for k in flatnonzero(some).tolist():
         mine = pieces == k
         low = float(view.height[mine & free].quantile(MERGE.edge))
         top = float(view.height[mine].quantile(MERGE.peak))

@@ -17,12 +17,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value, settle
+from torchgrasp.foundation.base import Value, flatnonzero, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.geometry.frames import apply, inverse
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.scene.image import DepthImage, find_nearest
 from torchgrasp.scene.scene import Scene
 
@@ -135,7 +135,7 @@ class Shadows(Value):
         pixel = torch.where(seen, row * width + column, 0)
         owner = torch.where(seen, self.owner.reshape(-1)[pixel], -1)
         deeper = z - self.depth.reshape(-1)[pixel]
-        behind = deeper * torch.linalg.vector_norm(camera, dim=-1) / safe
+        behind = deeper * norm(camera) / safe
         return behind, owner
 
 
@@ -300,7 +300,7 @@ def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     shadows = cast_shadows(scene, target)
     behind, owner = shadows.look(centres)
     inside = (owner != 0) & (behind > -OCCUPANCY.noise)
-    hidden = torch.nonzero((owner == -1) | inside)[:, 0]
+    hidden = flatnonzero((owner == -1) | inside)
     whose = owner[hidden]
     full = empty.probability.reshape(-1)
     for thing in whose.unique().tolist():

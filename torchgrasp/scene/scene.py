@@ -362,7 +362,7 @@ class Scene(Value):
             offset = self.points.double() - place
             reach = SCENE.touch
             text = f"point ({', '.join(f'{x:.3f}' for x in place.tolist())}) m"
-        distance = torch.linalg.vector_norm(offset, dim=-1)
+        distance = norm(offset)
         nearest = int(distance.argmin())
         if float(distance[nearest]) > reach:
             raise BadArgument("point", f"nothing measured at {text}", "a place on an object")

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.geometry.linalg import number_components
 from torchgrasp.scene.creases import cut_creases
@@ -102,7 +103,7 @@ def segment(view: TableImage) -> Int[Tensor, "h w"]:
     small = count_labels(labels) < scale_pixels(SEGMENT.small, labels)
     deviations = view.mean_height / view.fitted_noise
     noise = torch.zeros_like(small)
-    for k in torch.nonzero(small)[:, 0].tolist():
+    for k in flatnonzero(small).tolist():
         noise[k] = k > 0 and _is_noise(view, deviations, labels, k)
     return _numbered(torch.where(noise[labels], 0, labels))
 
@@ -203,8 +204,8 @@ def _grown(
     wide = np.full(risen.shape, SEGMENT.near) if near is None else near.double().numpy()
     labels = torch.where((count_labels(labels) < SEGMENT.few)[labels], 0, labels).reshape(-1)
     place = view.points.reshape(-1, 3).numpy()
-    loose = torch.nonzero(risen.reshape(-1) & (labels == 0))[:, 0]
-    new = torch.nonzero(labels)[:, 0]
+    loose = flatnonzero(risen.reshape(-1) & (labels == 0))
+    new = flatnonzero(labels > 0)
     for _ in range(SEGMENT.rounds):
         if not len(new) or not len(loose):
             break

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.files import save_tensors
-from torchgrasp.foundation.base import Batch, Value, named_tensors, read_rows
+from torchgrasp.foundation.base import Batch, Value, flatnonzero, named_tensors, read_rows
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, FailedRows, Status, TooFewPoints
 from torchgrasp.foundation.rules import ANY, Poses, Rows
@@ -97,7 +97,7 @@ class PointCloud(Value):
         if self.viewpoint is None or self.viewpoint.ndim == 1:
             return [torch.arange(len(self), device=self.points.device)]
         _, view = self.viewpoint.unique(dim=0, return_inverse=True)
-        return [torch.nonzero(view == k)[:, 0] for k in dict.fromkeys(view.tolist())]
+        return [flatnonzero(view == k) for k in dict.fromkeys(view.tolist())]
 
     def split_views(self) -> "list[PointCloud]":
         """Return one cloud for each camera, in the order of their first points.

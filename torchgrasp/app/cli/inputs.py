@@ -28,7 +28,7 @@ from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError
 from torchgrasp.foundation.limits import MAX_EXTENT
 from torchgrasp.geometry.frames import apply, real, rotate
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -217,7 +217,7 @@ def read_table(table: tuple[float, ...]) -> Plane | float:
     numbers = check_tensor("--table", real(table), (len(table),))
     if len(numbers) == 1:
         return float(numbers[0])
-    length = torch.linalg.vector_norm(numbers[:3])
+    length = norm(numbers[:3])
     if not bool(length > 0):
         raise BadArgument("--table", "a normal of length zero", "the direction that points up")
     return Plane(numbers[:3] / length, float(numbers[3] / length))

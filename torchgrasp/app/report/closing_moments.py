@@ -135,7 +135,7 @@ def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) ->
     force = closure.trace.forces[begin, finger]
     normal = closure.trace.normals[begin, finger]
     press = float((force @ normal).abs())
-    across = float(torch.linalg.vector_norm(force - (force @ normal) * normal))
+    across = float(norm(force - (force @ normal) * normal))
     loads = f"under {across:.1f} N across at {press:.1f} N of normal force"
     return f"{name} slid first, from {time:.2f} s on, {loads}"
 

@@ -14,7 +14,7 @@ from torchgrasp.app.report.raster import FULL
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.lazy import Image, ImageDraw, ImageFont, ndimage
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import assume_noise
 from torchgrasp.scene.image import DepthImage
@@ -267,7 +267,7 @@ def _with_legend(picture: Any, scene: Scene, kinds: Int[np.ndarray, "h w"]) -> A
 def _describe(scene: Scene, label: int) -> str:
     """Return the legend text of an object: its label, height, and distance from the camera."""
     points = scene.points[scene.rows_of(label)].double()
-    distance = float((points - scene.viewpoint).norm(dim=-1).median())
+    distance = float(norm(points - scene.viewpoint).median())
     high = ""
     if scene.table is not None:
         top = 1e3 * float(scene.table.height(points).quantile(TEXT.top))

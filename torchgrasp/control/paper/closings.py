@@ -25,7 +25,7 @@ from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.tactile import STILL, Observation, smooth
 from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
-from torchgrasp.geometry.linalg import limit_norm, norm
+from torchgrasp.geometry.linalg import dot, limit_norm, matvec, norm
 from torchgrasp.hand.drives import coupled_stiffness
 
 STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (Sec. 6.5).
@@ -107,7 +107,7 @@ class PaperClosing:
         error = gains.target - reference.contact_points(observation.tips)
         self.share = blend(error, gains.covariance)
         self.settled.update(observation, observation.tactile.contact, self.share, period)
-        desired = -(gains.desired_force * normals).sum(-1)
+        desired = -dot(gains.desired_force, normals)
         force_error = -(desired - observation.tactile.reading)[:, None] * normals
         velocity = tip_velocity(
             error, force_error, self.share, gains.position_gain, gains.force_gain, together=True
@@ -208,7 +208,7 @@ def shared_forces(
     Points, forces and wrench are in one frame. All forces are scaled down by one factor if one
     would exceed `most` [N].
     """
-    shared = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0]
+    shared = matvec(torch.linalg.pinv(grasp_map(points)), wrench)
     forces = shared.unflatten(-1, (3, 3))
     largest = norm(forces).amax(-1)
     return forces * (most / torch.maximum(largest, most))[..., None, None]
