@@ -79,9 +79,7 @@ def check_agreement(
         distance = distance_behind(points, other)
         surface = "the cloud or behind it"
     else:
-        from trimesh.proximity import closest_point
-
-        distance = torch.from_numpy(closest_point(other, points.numpy())[1])
+        distance = torch.from_numpy(trimesh.proximity.closest_point(other, points.numpy())[1])
         surface = "the mesh's surface"
     far = distance > slack
     if float(far.double().mean()) > share:

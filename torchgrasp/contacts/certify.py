@@ -30,6 +30,7 @@ from torchgrasp.contacts.form_closure import (
 from torchgrasp.foundation.base import FINGERTIPS, flatnonzero, map_rows
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import optimize
 from torchgrasp.foundation.rules import is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
@@ -252,15 +253,13 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None,
     `wrench` (m, 6) holds the m edge wrenches, which are the columns of W. The witness is None if it
     is unknown.
     """
-    from scipy.optimize import linprog
-
     m = len(wrench)  # seven equations in the margin s and psi = phi - s >= 0
     equations = np.zeros((7, m + 1))
     equations[:6, :m] = wrench.T
     equations[:6, m] = wrench.sum(0)
     equations[6, :m] = 1.0
     equations[6, m] = m
-    solution = linprog(
+    solution = optimize.linprog(
         c=np.r_[np.zeros(m), -1.0],
         A_eq=equations,
         b_eq=np.r_[np.zeros(6), 1.0],

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value, row_numbers, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.fused import is_fused
+from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.plane import Plane, as_plane
@@ -119,12 +120,10 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 
     `spacing` [m] is the edge of a voxel. For an empty region the distance is larger than the grid.
     """
-    from scipy.ndimage import distance_transform_edt
-
     if not bool(region.any()):
         far = spacing * sum(region.shape)
         return torch.full(region.shape, far, dtype=torch.float64, device="cpu")
-    steps = torch.from_numpy(np.asarray(distance_transform_edt(~region.numpy())))
+    steps = torch.from_numpy(np.asarray(ndimage.distance_transform_edt(~region.numpy())))
     return (spacing * (steps - 0.5)).clamp_min(0.0)
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import flatnonzero, join
+from torchgrasp.foundation.lazy import optimize
 from torchgrasp.geometry.frames import apply, degenerate, inverse, virtual_frame
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.hand.hand import Hand
@@ -157,19 +158,17 @@ class CobylaRun:
 
         Raises `DegenerateContacts` for contacts on a line.
         """
-        from scipy.optimize import NonlinearConstraint, minimize
-
         first = self.first.cpu().numpy()
         limits = [
             (b.double().cpu().numpy() - first) / COBYLA.angle
             for b in (self.hand.lower, self.hand.upper)
         ]
-        solution = minimize(
+        solution = optimize.minimize(
             lambda x: self.evaluate(x)[0],
             np.zeros(self.hand.dof),
             method="COBYLA",
             bounds=list(zip(*limits, strict=True)),
-            constraints=[NonlinearConstraint(lambda x: self.evaluate(x)[1], 0.0, np.inf)],
+            constraints=[optimize.NonlinearConstraint(lambda x: self.evaluate(x)[1], 0.0, np.inf)],
             tol=COBYLA.end,
             options={"rhobeg": COBYLA.start, "maxiter": COBYLA.evaluations},
         )

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.foundation.rules import ANY, Pose
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import norm, unit
@@ -410,8 +410,6 @@ class _Top:
     """
 
     def __init__(self, corners: Float[Tensor, "k 3 3"]) -> None:
-        from scipy.spatial import KDTree
-
         # points all over the triangles
         faces = np.arange(3 * len(corners)).reshape(-1, 3)
         vertices = corners.flatten(0, 1).numpy()
@@ -422,7 +420,7 @@ class _Top:
         size = ((points[:, :2].amax(0) + margin - self.low) / DRAG.cell).ceil().long() + 1
         steps = [torch.arange(int(count), device="cpu").double() for count in size]
         self.nodes = self.low + DRAG.cell * torch.stack(torch.meshgrid(*steps, indexing="ij"), -1)
-        gap, index = KDTree(points[:, :2].numpy()).query(self.nodes.numpy())
+        gap, index = spatial.KDTree(points[:, :2].numpy()).query(self.nodes.numpy())
         self.height = points[torch.from_numpy(index), 2]
         self.seen = torch.from_numpy(gap) <= DRAG.near
 

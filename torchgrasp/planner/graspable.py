@@ -13,6 +13,7 @@ from torch import Tensor
 from torchgrasp.cloud.check import FEW_POINTS
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import to_upright, upright_frame
 from torchgrasp.geometry.support_search import find_table
@@ -175,12 +176,11 @@ def _thickness(points: Float[Tensor, "n 2"], cell: float) -> float:
     """Return the diameter [m] of the largest disc in the area that points fill, on a grid with this
     `cell` side [m].
     """
-    from scipy.ndimage import binary_closing, distance_transform_edt
-
     place = torch.floor((points - points.amin(0)) / cell).long().numpy() + 2
     filled = np.zeros(place.max(0) + 3, dtype=bool)
     filled[tuple(place.T)] = True
-    inside = np.asarray(distance_transform_edt(binary_closing(filled, np.ones((3, 3)))))
+    closed = ndimage.binary_closing(filled, np.ones((3, 3)))
+    inside = np.asarray(ndimage.distance_transform_edt(closed))
     return (2 * float(inside.max()) - 1) * cell
 
 
@@ -253,14 +253,12 @@ def _free_space(points: np.ndarray, mine: np.ndarray) -> float:
 
     `points` (n, 3) [m] are those of all objects, and `mine` is a mask of the object's own.
     """
-    from scipy.spatial import KDTree
-
     own = points[mine]
     beside = np.abs(points - own.mean(0)) < np.ptp(own, 0) + EASE.room
     near = ~mine & beside.all(1)
     if not near.any():
         return EASE.room
-    return KDTree(points[near]).query(own, distance_upper_bound=EASE.room)[0].min()
+    return spatial.KDTree(points[near]).query(own, distance_upper_bound=EASE.room)[0].min()
 
 
 def _covered(points: np.ndarray, mine: np.ndarray, column: np.ndarray) -> float:
@@ -282,12 +280,10 @@ def _clarity(scene: Scene, pixels: Int[Tensor, "n 2"]) -> float:
     Pixels should be small beside a contact, cover more than the fingertips, and have a convex
     outline.
     """
-    from scipy.spatial import ConvexHull
-
     pixel = float(scene.image.depth[tuple(pixels.T)].median()) / scene.image.focal
     seen = len(pixels) * pixel**2 / (3 * math.pi * TIP_RADIUS**2)
     convex = 0.0
     if len(pixels) > 2:
-        outline = ConvexHull(pixels.cpu().numpy(), qhull_options="QJ")
+        outline = spatial.ConvexHull(pixels.cpu().numpy(), qhull_options="QJ")
         convex = len(pixels) / outline.volume
     return min(FLAT_RADII[0] / pixel, 1.0) + min(seen, 1.0) + min(convex, 1.0)

@@ -19,7 +19,7 @@ import torch
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import MeshError, ModelFileError, OutputError
-from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.geometry.mesh import LEAST_VOLUME, check_solid, read_mesh
 from torchgrasp.sim.decompose import decompose
 
@@ -137,19 +137,17 @@ def _bulge(parts: "Sequence[trimesh.Trimesh]", mesh: "trimesh.Trimesh") -> float
 
     It is a quantile (`CUT.within`) over points drawn evenly from the surfaces of the parts.
     """
-    from trimesh.proximity import closest_point
-    from trimesh.sample import sample_surface
-
     shares = np.array([part.area for part in parts])
     counts = np.ceil(CUT.sampled * shares / shares.sum()).astype(int)
     drawn = [
-        sample_surface(part, count, seed=0)[0] for part, count in zip(parts, counts, strict=True)
+        trimesh.sample.sample_surface(part, count, seed=0)[0]
+        for part, count in zip(parts, counts, strict=True)
     ]
     points = np.concatenate(drawn)
     outside = ~mesh.contains(points)
     height = np.zeros(len(points))
     if outside.any():
-        height[outside] = closest_point(mesh, points[outside])[1]
+        height[outside] = trimesh.proximity.closest_point(mesh, points[outside])[1]
     return float(np.quantile(height, CUT.within))
 
 
@@ -226,8 +224,6 @@ def _load(path: Path, mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
     """Read the parts of a cache file as hulls of their vertices. Raise an error for vertices far
     outside the mesh.
     """
-    from scipy.spatial import QhullError
-
     tensors, _ = load_tensors(path, "parts", {"vertices", "counts"})
     try:
         vertices = tensors["vertices"]
@@ -236,6 +232,6 @@ def _load(path: Path, mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
             raise RuntimeError("corners far outside the mesh")
         corners = torch.split(vertices, tensors["counts"].tolist())
         return [hull(c.numpy()) for c in corners]
-    except (QhullError, RuntimeError) as error:
+    except (spatial.QhullError, RuntimeError) as error:
         allowed = "corners of bodies with a volume"
         raise ModelFileError("path", f"{path}: {error}", allowed) from error
