@@ -115,6 +115,11 @@ def number_rows(rows: Shaped[Tensor, "n d"]) -> Int[Tensor, "n"]:
     return number
 
 
+def number_cells(places: Float[Tensor, "n d"], side: float) -> Int[Tensor, "n"]:
+    """Return the number of the grid cell of each of n places, from 0; a cell is `side` wide."""
+    return number_rows(torch.floor(places / side).long())
+
+
 def fibonacci_sphere(
     n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5
 ) -> Float[Tensor, "n 3"]:

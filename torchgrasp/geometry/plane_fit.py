@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.linalg import Points, Vector, dot, norm, number_rows, unit
+from torchgrasp.geometry.linalg import Points, Vector, dot, norm, number_cells, unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,7 +247,7 @@ def _common_normal(points: Points, normal: Vector) -> Vector:
     """Return the unit normal that parallel levels of points [m] near a plane share, whatever their
     offsets: it is fitted to patches of them, without those in which a step lies.
     """
-    patch = number_rows(torch.floor(points @ plane_axes(normal, points) / PLANES.patch).long())
+    patch = number_cells(points @ plane_axes(normal, points), PLANES.patch)
     count = torch.bincount(patch).to(points)
     middle = points.new_zeros(len(count), 3).index_add_(0, patch, points) / count[:, None]
     rest = points - middle[patch]

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.lazy import ndimage, spatial
-from torchgrasp.geometry.linalg import Points, Vector, number_rows
+from torchgrasp.geometry.linalg import Points, Vector, number_cells
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import PLANES, plane_axes
 
@@ -214,7 +214,7 @@ def _crossed(
     There the plane cuts a wall or a bed, or ends. `flat` holds the place of each point in the plane
     [m], and `height` is that above it [m]. The points `on` lie on it.
     """
-    cells = number_rows(torch.floor(flat / SUPPORTS.pierced_cell).long())
+    cells = number_cells(flat, SUPPORTS.pierced_cell)
     below = ~on & (height < 0) & (height > -SUPPORTS.low)
     lower = torch.bincount(cells, below.double())
     return (lower > SUPPORTS.crossed * torch.bincount(cells, on.double()))[cells]

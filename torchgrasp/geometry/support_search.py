@@ -7,12 +7,12 @@ import dataclasses
 import math
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument, NoSupport
-from torchgrasp.geometry.linalg import Points, Vector, norm, number_rows, unit
+from torchgrasp.geometry.linalg import Points, Vector, norm, number_cells, unit
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.plane_fit import (
     PLANES,
@@ -428,16 +428,11 @@ def _count_through(view: SeenPoints, surface: _FlatSurface, support: SupportPlan
     seen = behind & (surface.height < -surface.tolerance) & support.covers(crossing, -inner)
     axes = plane_axes(surface.fit.normal, view.points)
     # slats show what is behind them beside points of their own
-    cell = _number_cells(crossing, axes, SUPPORTS.cell)
+    cell = number_cells(crossing @ axes, SUPPORTS.cell)
     slats = torch.bincount(cell, surface.on.double())
     gaps = torch.bincount(cell, seen.double())
     slatted = slats > SUPPORTS.slats * gaps
     return int((seen & ~slatted[cell]).sum())
-
-
-def _number_cells(points: Points, axes: Float[Tensor, "3 2"], side: float) -> Int[Tensor, "n"]:
-    """Return the number of each point's square in a grid, `side` [m] wide along two `axes`."""
-    return number_rows(torch.floor(points @ axes / side).long())
 
 
 def _furniture(
@@ -489,7 +484,7 @@ def _count_pierced(view: SeenPoints, surface: _FlatSurface, risen: _Risen) -> in
     depth = -surface.height
     below = (depth > SUPPORTS.sag * surface.tolerance) & (depth < SUPPORTS.low)
     axes = plane_axes(surface.fit.normal, view.points)
-    cell = _number_cells(view.points, axes, SUPPORTS.pierced_cell)
+    cell = number_cells(view.points @ axes, SUPPORTS.pierced_cell)
     under = torch.bincount(cell, below.double())
     standing = torch.bincount(cell, risen.standing.double())
     pierced = under > SUPPORTS.below * standing

@@ -89,6 +89,13 @@ class BoundedBuilder(ET.TreeBuilder):
         return super().end(tag)
 
 
+def bounded_tree(data: bytes | str) -> ET.Element:
+    """Return the tree of an XML text. Raises `HandFileError` for too many elements or too deep
+    nesting, `ParseError` or `ValueError` for another fault.
+    """
+    return ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
+
+
 def parse_urdf(path: Path, data: bytes, visual: bool = False) -> ET.Element:
     """Return the XML tree of a URDF with only links and joints, and with checked numbers.
 
@@ -113,7 +120,7 @@ def parse_urdf(path: Path, data: bytes, visual: bool = False) -> ET.Element:
     ):
         raise HandFileError("urdf", f"{path} in another encoding", "UTF-8 text")
     try:
-        robot = ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
+        robot = bounded_tree(data)
     except (ET.ParseError, ValueError) as error:
         if isinstance(error, HandFileError):
             raise
@@ -142,7 +149,7 @@ def seen_links(data: bytes) -> tuple[str, ...]:
 
     `data` are the bytes of a file that `parse_urdf` took.
     """
-    robot = ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
+    robot = bounded_tree(data)
     return tuple(link.get("name", "") for link in _seen_only(robot))
 
 

@@ -21,7 +21,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import HandFileError
 from torchgrasp.foundation.lazy import yourdfpy
 from torchgrasp.foundation.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
-from torchgrasp.hand.safe_xml import DEGREES, FULL_TURN, SIZES, BoundedBuilder, parse_urdf
+from torchgrasp.hand.safe_xml import DEGREES, FULL_TURN, SIZES, bounded_tree, parse_urdf
 
 AXIS_ERROR = 0.001  # largest error of the length of a joint's axis
 DEEPEST = 100  # most links in a line: pytorch-kinematics walks the tree by recursion
@@ -216,7 +216,7 @@ def read_visuals(path: Path, data: bytes) -> dict[str, tuple[LinkShape, ...]]:
 
     Pictures alone use them: the dict is empty if any of them is malformed.
     """
-    robot = ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
+    robot = bounded_tree(data)
     for link in robot.findall("link"):
         for shape in link.findall("collision"):
             link.remove(shape)

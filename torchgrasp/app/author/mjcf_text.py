@@ -21,7 +21,7 @@ from torchgrasp.foundation.limits import (
     XML_ELEMENTS,
     XML_LETTERS,
 )
-from torchgrasp.hand.safe_xml import BoundedBuilder
+from torchgrasp.hand.safe_xml import bounded_tree
 
 SECTIONS = {"compiler", "default", "asset", "worldbody", "contact", "equality", "tendon"}
 """The sections of an MJCF that are read, beside its actuators."""
@@ -153,7 +153,7 @@ def _parse(path: Path) -> ET.Element:
         raise refuse(f"{path}: a DOCTYPE or ENTITY declaration", "MJCF without declarations")
     try:
         data.decode("utf-8-sig")
-        return ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
+        return bounded_tree(data)
     except UnicodeDecodeError as error:
         raise refuse(f"{path}: {error.reason} at byte {error.start}", "UTF-8 text") from error
     except HandFileError as error:

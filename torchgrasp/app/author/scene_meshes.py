@@ -9,7 +9,7 @@ import xml.etree.ElementTree as ET
 from torchgrasp.files import Malformed
 from torchgrasp.foundation.errors import BadArgument, MissingExtra
 from torchgrasp.foundation.limits import MESH_FACES
-from torchgrasp.hand.safe_xml import BoundedBuilder
+from torchgrasp.hand.safe_xml import bounded_tree
 
 MOST_INDICES = 12 * MESH_FACES  # three corners of a face, each of up to four indices
 MAGIC = b"glTF"  # with which a .glb file begins
@@ -32,7 +32,7 @@ def clean_dae(data: bytes) -> tuple[bytes, float]:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise Malformed("a DOCTYPE or ENTITY declaration")
     try:
-        root = ET.fromstring(text, ET.XMLParser(target=BoundedBuilder()))
+        root = bounded_tree(text)
     except BadArgument as error:
         raise Malformed(f"{error.found} than {error.allowed}") from error
     space = root.tag.partition("}")[0] + "}"
