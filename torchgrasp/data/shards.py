@@ -17,7 +17,7 @@ from torch import Tensor
 from torchgrasp.files import Field, pack_tensors, read_value
 from torchgrasp.foundation.base import FINGERTIPS, Value, map_tensors, named_tensors
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import ModelFileError, Status
+from torchgrasp.foundation.errors import ModelFileError, Status, one_line
 from torchgrasp.foundation.limits import JSON_LETTERS
 from torchgrasp.foundation.rules import is_rigid
 from torchgrasp.values.planning import Grasps
@@ -178,7 +178,7 @@ def read_row(field: Field, bare: bool = False) -> JobRow:
 
 def short(text: str) -> str:
     """Return a text on one line, cut to the largest length that `read_row` accepts."""
-    line = " ".join(text.split())
+    line = one_line(text)
     return line if len(line) <= JSON_LETTERS else f"{line[: JSON_LETTERS - 3]}..."
 
 

@@ -24,7 +24,7 @@ from torchgrasp.evaluation.views import (
 )
 from torchgrasp.files import hold_folder, temporary_folder
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import DatasetError, Status
+from torchgrasp.foundation.errors import DatasetError, Status, one_line
 from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.foundation.rules import Range
 from torchgrasp.hand.hand import Hand
@@ -90,7 +90,7 @@ def evaluate(
     refused = []
     for name, entry in read_entries(objects, spec.only).items():
         if isinstance(entry, DatasetError):
-            note = " ".join(str(entry).split())
+            note = one_line(entry)
             bad = ViewScore(ascii(name), "", 0, math.nan, refusal=Status.BAD_OBJECT, note=note)
             refused.append(bad)
         else:

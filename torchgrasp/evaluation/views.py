@@ -27,7 +27,14 @@ from torchgrasp.evaluation.touch import measure_touch
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.foundation.base import Value, count_status
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
+from torchgrasp.foundation.errors import (
+    BadArgument,
+    GraspError,
+    MissingExtra,
+    OutputError,
+    Status,
+    one_line,
+)
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Count, Seed
 from torchgrasp.geometry.plane import Plane
@@ -213,7 +220,7 @@ def plan_view(
     except (MissingExtra, OutputError):
         raise
     except GraspError as error:
-        note = " ".join(str(error).split())
+        note = one_line(error)
         spent = time.process_time() - started
         bad = {"refusal": Status.BAD_OBJECT, "note": note, "seconds": spent}
         return PlannedView(dataclasses.replace(score, **bad))

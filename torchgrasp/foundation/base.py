@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchgrasp.foundation.checks import read_number
-from torchgrasp.foundation.errors import BadArgument, FailedRows, Status
+from torchgrasp.foundation.errors import BadArgument, FailedRows, Status, one_line
 from torchgrasp.foundation.rules import Range, check_moved, show
 from torchgrasp.foundation.settings import usual_settings
 
@@ -185,7 +185,7 @@ def _short(value: Any) -> str:
         return f"{type(value).__name__} of {len(value)}"
     text = repr(value)
     if isinstance(value, Value):  # it is wrapped once, as a whole
-        text = " ".join(text.split())
+        text = one_line(text)
     if len(text) <= WIDTH or isinstance(value, Value):
         return text
     return f"{text[: WIDTH - len('...')]}..."

@@ -49,6 +49,11 @@ class BadArgument(GraspError, ValueError):
         self.allowed = allowed
 
 
+def one_line(told: object) -> str:
+    """Return an error, a warning or a text as one line, without breaks and double spaces."""
+    return " ".join(str(told).split())
+
+
 def _suggest(found: str, allowed: str) -> str:
     """Return a text that names the word of `allowed` nearest to a quoted word that was found.
 

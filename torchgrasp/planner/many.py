@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import torch
 
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra, Status
+from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra, Status, one_line
 from torchgrasp.foundation.jobs import pack, run_tasks, unpack
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
@@ -153,7 +153,7 @@ def _or_refuse(function: Callable[[Request], Result], request: Request) -> Resul
     except MissingExtra:
         raise
     except GraspError as error:
-        return _refused(request.hand, " ".join(str(error).split()))
+        return _refused(request.hand, one_line(error))
 
 
 def _refused(hand: Hand, reason: str) -> Grasps:

@@ -14,7 +14,7 @@ from torchgrasp.app.author.mjcf_hand import ModelHand
 from torchgrasp.app.author.mjcf_text import read_mjcf_text
 from torchgrasp.app.author.mjcf_urdf import UrdfWriter
 from torchgrasp.files import write_file
-from torchgrasp.foundation.errors import HandFileError
+from torchgrasp.foundation.errors import HandFileError, one_line
 from torchgrasp.foundation.limits import HAND_LINKS
 from torchgrasp.hand.urdf import Urdf, read_published
 from torchgrasp.sim.mujoco_scene import import_mujoco
@@ -54,7 +54,7 @@ def read_mjcf(
     try:
         model = mujoco.MjModel.from_xml_string(safe.text, safe.meshes)
     except ValueError as error:
-        said = " ".join(str(error).split())
+        said = one_line(error)
         raise refuse(f"{path}: {said}", "a file that MuJoCo compiles") from error
     if model.nbody > HAND_LINKS:
         raise refuse(f"{path} of {model.nbody} bodies", f"at most {HAND_LINKS} bodies")

@@ -21,7 +21,7 @@ from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
 from torchgrasp.app.cli.command import WORDS, Command, execute
-from torchgrasp.foundation.errors import BadArgument, GraspError
+from torchgrasp.foundation.errors import BadArgument, GraspError, one_line
 
 __all__ = ["main", "run_and_exit"]
 
@@ -158,7 +158,7 @@ def _guard(given: list[str]) -> int:
         print(end="", flush=True)  # Python's own flush would come too late for an exit code
         return code
     except GraspError as error:
-        print(f"torchgrasp: {_sentence(error)}", file=sys.stderr)
+        print(f"torchgrasp: {one_line(error)}", file=sys.stderr)
         return 2
     except _Terminated:
         print("torchgrasp: terminated", file=sys.stderr)
@@ -236,11 +236,6 @@ def format_help() -> str:
     return "\n".join(lines)
 
 
-def _sentence(told: object) -> str:
-    """Return an error or a warning as one line of text."""
-    return " ".join(str(told).split())
-
-
 @contextlib.contextmanager
 def _open_streams() -> Iterator[None]:
     """Replace missing standard streams by the null device, so that no other file gets their
@@ -298,4 +293,4 @@ class _Terminated(KeyboardInterrupt):
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
     """Print a warning as one sentence on stderr, like an error."""
-    print(f"{category.__name__}: {_sentence(message)}", file=sys.stderr)
+    print(f"{category.__name__}: {one_line(message)}", file=sys.stderr)

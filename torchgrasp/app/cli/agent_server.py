@@ -32,7 +32,7 @@ from torchgrasp.app.cli.agent_files import Workplace
 from torchgrasp.app.cli.agent_tools import TOOLS, TellHealth, Tool, make_tool
 from torchgrasp.app.cli.agents import SERVER
 from torchgrasp.app.cli.command import naming
-from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra
+from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra, one_line
 from torchgrasp.foundation.rules import Range
 
 HOST = "127.0.0.1"  # HTTP is served to programs of this machine alone
@@ -152,7 +152,7 @@ class AgentServer:
         listed = [
             self.types.Tool(
                 name=name,
-                description=" ".join((tool.__doc__ or "").split()),
+                description=one_line(tool.__doc__ or ""),
                 input_schema=make_schema(tool),
                 output_schema=make_schema(typing.get_type_hints(tool.run)["return"]),
                 annotations=self.types.ToolAnnotations(
@@ -295,7 +295,7 @@ def _stdin_that_ends() -> Iterator[None]:
 
 def say(told: GraspError | str) -> str:
     """Return an error or advice as one line, with arguments of tools in place of options."""
-    line = " ".join(str(told).split())
+    line = one_line(told)
     if LIBRARY in line:
         return line
     return OPTION.sub(lambda found: found[1].replace("-", "_"), line)

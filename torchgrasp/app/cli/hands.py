@@ -38,7 +38,7 @@ from torchgrasp.app.report.stills import draw_hand, opposed_posture
 from torchgrasp.data.shipped import load_object
 from torchgrasp.files import format_columns, format_json, hold_file, render, write_file
 from torchgrasp.foundation.base import count_status
-from torchgrasp.foundation.errors import BadArgument, GraspError, OutputError, Status
+from torchgrasp.foundation.errors import BadArgument, GraspError, OutputError, Status, one_line
 from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.geometry.linalg import dot, norm
 from torchgrasp.hand.abilities import HandAbilities, hand_abilities, random_joints
@@ -269,7 +269,7 @@ def _checked(folder: Path) -> Hand | None:
         try:
             return check_hand(folder)
         except GraspError as error:
-            faults = (" ".join(str(error).split()),)
+            faults = (one_line(error),)
     print_faults(faults)
     return None
 
@@ -295,7 +295,7 @@ def list_faults(hand: str | Path, fingers: str = "default") -> tuple[str, ...]:
         if error.argument == "fingers":
             raise
         faults = [error]
-    return tuple(dict.fromkeys(" ".join(str(fault).split()) for fault in faults))
+    return tuple(dict.fromkeys(map(one_line, faults)))
 
 
 def list_unusual(hand: Hand) -> list[str]:

@@ -20,7 +20,7 @@ from torchgrasp.app.report.stills import facing
 from torchgrasp.control.reference import check_single
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError
+from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError, one_line
 from torchgrasp.foundation.lazy import Image, trimesh
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import inverse, real
@@ -203,7 +203,7 @@ def _encode_mp4(pictures: list[UInt8[np.ndarray, "h w 3"]], rate: int, path: Pat
         raw = b"".join(picture.tobytes() for picture in pictures)
         done = subprocess.run(words, input=raw, capture_output=True, check=False)
         if done.returncode != 0 or not file.is_file():
-            said = " ".join(done.stderr.decode(errors="replace").split())[: MOVIE.most_error]
+            said = one_line(done.stderr.decode(errors="replace"))[: MOVIE.most_error]
             wanted = "an ffmpeg with libx264, as of the extra film"
             raise OutputError("path", f"{path}, which ffmpeg cannot encode ({said})", wanted)
         return file.read_bytes()
