@@ -4,7 +4,7 @@ import numpy as np
 
 from torchgrasp.foundation.fused import compiled, inlined
 from torchgrasp.geometry.box_tree import Boxes
-from torchgrasp.geometry.fused_vectors import dot, minus
+from torchgrasp.geometry.fused_vectors import dot, insert, minus
 
 
 def nearest(points: np.ndarray, boxes: Boxes, limit: float) -> tuple[np.ndarray, np.ndarray]:
@@ -38,18 +38,6 @@ def _squared_gap(point, low, high):
 
 
 @inlined
-def _keep_nearest(squared, index, kept, kept_index):
-    """Insert a squared distance and its sample into the ascending list of the nearest."""
-    k = len(kept) - 1
-    while k > 0 and squared < kept[k - 1]:
-        kept[k] = kept[k - 1]
-        kept_index[k] = kept_index[k - 1]
-        k -= 1
-    kept[k] = squared
-    kept_index[k] = index
-
-
-@inlined
 def find_nearest(point, boxes, stack, kept, nearest):
     """Write the nearest samples into `nearest`, which are nearer than `kept`, with their squared
     distances.
@@ -70,7 +58,7 @@ def find_nearest(point, boxes, stack, kept, nearest):
                 away = minus(point, samples[leaf, j])
                 squared = dot(away, away)
                 if squared < kept[last]:
-                    _keep_nearest(squared, leaf * size + j, kept, nearest)
+                    insert(kept, nearest, squared, leaf * size + j)
             continue
         # the nearer half is searched first
         halves = 2 * box

@@ -48,6 +48,18 @@ def copy(to, values):
 
 
 @inlined
+def insert(values, owners, value, owner):
+    """Put a value among ascending ones, and its owner among theirs; the last ones fall out."""
+    k = len(values) - 1
+    while k > 0 and values[k - 1] > value:
+        values[k] = values[k - 1]
+        owners[k] = owners[k - 1]
+        k -= 1
+    values[k] = value
+    owners[k] = owner
+
+
+@inlined
 def factorise(matrix):
     """Replace the lower half of a matrix by its Cholesky factor; return whether there is one."""
     for i in range(len(matrix)):

@@ -11,24 +11,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.fused import array, compiled, inlined
-from torchgrasp.geometry.fused_vectors import dot, put
+from torchgrasp.geometry.fused_vectors import dot, insert, put
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld
 from torchgrasp.ik.fused_world import place, turn, world_parts
 
 BLOCK = 32  # numbers that are compared at a time, by vector instructions
-
-
-@inlined
-def _insert(values, owners, value, owner):
-    """Put a value among ascending ones, and its owner among theirs; the last ones fall out."""
-    k = len(values) - 1
-    while k > 0 and values[k - 1] > value:
-        values[k] = values[k - 1]
-        owners[k] = owners[k - 1]
-        k -= 1
-    values[k] = value
-    owners[k] = owner
 
 
 @inlined
@@ -45,7 +33,7 @@ def _find_least(numbers, block, least, index):
         if less:
             for k in range(len(own)):
                 if own[k] < least[-1]:
-                    _insert(least, index, own[k], first + k)
+                    insert(least, index, own[k], first + k)
 
 
 @inlined
@@ -114,7 +102,7 @@ def _rank(energy, obj_from_vf, vf_from_hand, spheres, parts, numbers, candidates
                 given = part, frame, spheres[sample], clearance, unit
                 cost = _collide(*given, cost, costs[-1], node)
             if cost < costs[-1]:
-                _insert(costs, pairs[r], cost, index[c])
+                insert(costs, pairs[r], cost, index[c])
 
 
 def rank_pairs(
