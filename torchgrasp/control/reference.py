@@ -300,7 +300,7 @@ def _distance_variance(grasp: Grasps) -> Float[Tensor, "f"] | None:
     It is `std_m`^2 if the grasp has no normalised variance.
     """
     contacts = grasp.contacts
-    unit_m = _number(grasp, "unit_m")
+    unit_m = _unit_length(grasp)
     if contacts.variance is None:
         return contacts.require_std()[0] ** 2
     return None if unit_m is None else contacts.variance[0] * unit_m**2
@@ -321,9 +321,11 @@ def _friction(grasp: Grasps) -> float | Distribution:
     return friction.simplest
 
 
-def _number(grasp: Grasps, name: str) -> float | None:
-    """Return a positive number by `name` from the metadata of a grasp; None if they lack it."""
-    text = grasp.meta.get(name)
+def _unit_length(grasp: Grasps) -> float | None:
+    """Return the length [m] of the normalised unit, from the metadata of a grasp; None if they lack
+    it.
+    """
+    text = grasp.meta.get("unit_m")
     if text is None:
         return None
     try:
@@ -331,7 +333,7 @@ def _number(grasp: Grasps, name: str) -> float | None:
     except ValueError:
         number = math.nan
     if not number > 0.0:
-        raise BadArgument(f"grasp.meta[{name!r}]", repr(text), "a positive number")
+        raise BadArgument("grasp.meta['unit_m']", repr(text), "a positive number")
     return number
 
 

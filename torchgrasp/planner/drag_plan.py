@@ -306,7 +306,7 @@ class _PressSearch:
         able = (count == tips) & (self.postures.strength >= self.force / tips)
         rows = flatnonzero(able)[: DRAG.postures]
         postures = self.postures[rows]
-        turns = _turns(DRAG.turns)  # (t, 3, 3)
+        turns = _turns()  # (t, 3, 3)
         steady = _is_steady(postures, turns.mT @ outward)  # (p, t)
         turned = (turns @ postures.feet[:, None].mT).mT  # (p, t, f, 3)
         presses = postures.presses[:, None]  # (p, 1, f)
@@ -386,9 +386,9 @@ def _angles(count: int) -> Float[Tensor, "t"]:
     return torch.arange(count, device="cpu").double() * (2 * math.pi / count)
 
 
-def _turns(count: int) -> Float[Tensor, "t 3 3"]:
-    """Return the rotations about the vertical by `count` equal steps."""
-    angles = _angles(count)
+def _turns() -> Float[Tensor, "t 3 3"]:
+    """Return the rotations about the vertical by `DRAG.turns` equal steps."""
+    angles = _angles(DRAG.turns)
     cosine = torch.cos(angles)
     sine = torch.sin(angles)
     zero = torch.zeros_like(angles)
