@@ -23,12 +23,12 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.foundation.rules import Positive
-from torchgrasp.geometry.frames import inverse, rotation_from_rpy
+from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane, upright_frame
 from torchgrasp.hand.drives import stiff_drives
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.urdf import Joint, Link, LinkShape
+from torchgrasp.hand.urdf import Joint, Link, pose_of
 from torchgrasp.ik.motion import opened_pose
 from torchgrasp.shape.surface import Surface
 from torchgrasp.sim.convex_parts import hull, read_solid
@@ -343,12 +343,9 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
     if wrong := [x.name for x in (*links, *joints) if not x.name.isidentifier()]:
         allowed = "names of letters, digits and _, which USD allows"
         raise BadArgument("hand", repr(wrong[0]), allowed)
-    poses = {still.name: np.eye(4)}
-    left = list(joints)
-    while left:
-        for joint in [x for x in left if x.parent in poses]:
-            left.remove(joint)
-            poses[joint.child] = poses[joint.parent] @ _pose(joint)
+    # the mount is at the root
+    poses = dict.fromkeys(names, np.eye(4))
+    poses |= {link.name: urdf.pose_at_zero(link.name) for link in urdf.links}
     meet = {frozenset(pair) for pair in scene.self_pairs}
     drives = dict.fromkeys((slide.name for slide in scene.slides), MOUNT_DRIVE) | scene.drives
     xx, xy, xz, yy, yz, zz = range(6)
@@ -365,7 +362,7 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
                     x.name for x in links[k + 1 :] if frozenset((x.name, link.name)) not in meet
                 ],
                 "shapes": [
-                    vars(x) | {"place": x.xyz, "rotation": quaternion(_pose(x)[:3, :3])}
+                    vars(x) | {"place": x.xyz, "rotation": quaternion(pose_of(x)[:3, :3])}
                     for x in link.shapes
                 ],
                 **_principal(np.array(link.inertia)[[[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]]),
@@ -377,7 +374,7 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
             | {
                 "place": x.xyz,
                 "axis": quaternion(_along(x.axis)),
-                "rotation": quaternion(_pose(x)[:3, :3] @ _along(x.axis)),
+                "rotation": quaternion(pose_of(x)[:3, :3] @ _along(x.axis)),
                 "drive": None if x.kind == "fixed" else drives[x.name],
                 "armature": ARMATURE * (x in urdf.joints),
                 "degrees": math.degrees(1.0) if x.kind == "revolute" else 1.0,
@@ -385,14 +382,6 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
             for x in joints
         ],
     }
-
-
-def _pose(of: "Joint | LinkShape") -> np.ndarray:
-    """Return the pose (4, 4) [m] of a joint or a shape in its link."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_from_rpy(of.rpy).numpy()
-    pose[:3, 3] = of.xyz
-    return pose
 
 
 def _along(axis: Sequence[float]) -> np.ndarray:

@@ -20,9 +20,9 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import pytorch_kinematics
 from torchgrasp.foundation.rules import is_known
-from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy, skew
+from torchgrasp.geometry.frames import real, skew
 from torchgrasp.geometry.linalg import eye_like
-from torchgrasp.hand.urdf import Urdf
+from torchgrasp.hand.urdf import Urdf, pose_of
 
 Frames = Float[Tensor, "3 4 l n"]  # poses (3 x 4) of l links in n postures
 
@@ -244,7 +244,7 @@ def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.chain.Chain":
         still = frame.Joint(dtype=torch.float64)
         frames = {urdf.root: frame.Frame(urdf.root, frame.Link(urdf.root), still)}
         for j in urdf.joints:
-            place = rigid(rotation_from_rpy(j.rpy), real(j.xyz))
+            place = torch.from_numpy(pose_of(j))
             ranges = (j.lower, j.upper), (-j.velocity, j.velocity), (-j.effort, j.effort)
             kind = "revolute" if j.kind == "continuous" else j.kind
             offset = pytorch_kinematics.transforms.Transform3d(matrix=place)

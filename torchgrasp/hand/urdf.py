@@ -15,12 +15,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from torchgrasp.files import read_bounded
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import HandFileError
 from torchgrasp.foundation.lazy import yourdfpy
 from torchgrasp.foundation.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
+from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy
 from torchgrasp.hand.safe_xml import DEGREES, FULL_TURN, SIZES, bounded_tree, parse_urdf
 
 AXIS_ERROR = 0.001  # largest error of the length of a joint's axis
@@ -172,6 +174,21 @@ class Urdf:
         first.
         """
         return tuple(j for j in self.joints_above(link) if j.kind != "fixed")
+
+    @checked
+    def pose_at_zero(self, link: str) -> Float[np.ndarray, "4 4"]:
+        """Return the pose (4, 4) [m] of the link named `link` in the root's frame, with every joint
+        at zero.
+        """
+        pose = np.eye(4)
+        for joint in self.joints_above(link):
+            pose = pose_of(joint) @ pose
+        return pose
+
+
+def pose_of(part: Joint | LinkShape) -> Float[np.ndarray, "4 4"]:
+    """Return the pose (4, 4) [m] of a joint or a shape in the frame of its parent link."""
+    return rigid(rotation_from_rpy(part.rpy), real(part.xyz)).numpy()
 
 
 @checked

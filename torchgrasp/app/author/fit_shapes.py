@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float
 
-from torchgrasp.app.author.repair import place, pose_of
+from torchgrasp.app.author.repair import place
 from torchgrasp.app.author.scene_meshes import check_glb, clean_dae
 from torchgrasp.files import explain, read_bounded
 from torchgrasp.foundation.errors import HandFileError, MissingExtra
@@ -21,7 +21,7 @@ from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.limits import HAND_MESH_BYTES, MAX_EXTENT, MESH_BYTES, MESH_FACES
 from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.hand.hand_toml import Pad
-from torchgrasp.hand.urdf import LinkShape, Urdf
+from torchgrasp.hand.urdf import LinkShape, Urdf, pose_of
 
 MEBIBYTE = 2**20  # [bytes]
 MESH_KINDS = (".stl", ".obj", ".ply", ".dae", ".glb")

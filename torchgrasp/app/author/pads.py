@@ -17,11 +17,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.app.author.repair import pose_of
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import chain_from_urdf, map_directions, map_points, pose_in_carrier
-from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf
+from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf, pose_of
 
 
 @dataclasses.dataclass(frozen=True)

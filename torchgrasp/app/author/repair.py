@@ -11,7 +11,7 @@ import numpy as np
 
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.hand.urdf import Joint, Link, LinkShape, Mimic, Triple, Urdf
+from torchgrasp.hand.urdf import Joint, Link, Mimic, Triple, Urdf, pose_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,11 +42,6 @@ class RepairNumbers:
 REPAIRS = RepairNumbers()
 BOX = 12  # divisor in the inertia of a solid box
 Step = tuple[Urdf, list[str]]  # the repaired URDF, and a report: a sentence for each repair
-
-
-def pose_of(part: Joint | LinkShape) -> np.ndarray:
-    """Return the pose (4, 4) [m] of a joint or a shape in the frame of its parent link."""
-    return trimesh.transformations.compose_matrix(angles=part.rpy, translate=part.xyz)
 
 
 def place(pose: np.ndarray) -> tuple[Triple, Triple]:

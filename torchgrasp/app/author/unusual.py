@@ -10,8 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from torchgrasp.app.author.repair import pose_of
-from torchgrasp.hand.urdf import Joint, Urdf
+from torchgrasp.hand.urdf import Urdf
 
 Bounds = tuple[float, float]  # the least and the greatest usual value
 
@@ -61,9 +60,11 @@ def find_unusual(urdf: Urdf, points: Mapping[str, Sequence[np.ndarray]]) -> list
     mass = sum(x.mass for x in urdf.links)
     places = [(j.name, math.hypot(*j.xyz)) for j in urdf.joints]
     first = [j for j in urdf.movable if not urdf.movers(j.parent)]
+    # a joint's frame at zero is that of its child
+    at_zero = {j.name: urdf.pose_at_zero(j.child)[:3, 3].tolist() for j in first}
     apart = [
-        (f"{one.name} and {two.name}", math.dist(_at_rest(urdf, one), _at_rest(urdf, two)))
-        for one, two in itertools.combinations(first, 2)
+        (f"{one} and {two}", math.dist(at_zero[one], at_zero[two]))
+        for one, two in itertools.combinations(at_zero, 2)
     ]
     farthest = sorted(apart, key=lambda pair: pair[1])[-1:]
     named = [
@@ -87,14 +88,6 @@ def find_unusual(urdf: Urdf, points: Mapping[str, Sequence[np.ndarray]]) -> list
             named.append((f"the {what} of {kind}", *rest))
     found = [_outside(*kind) for kind in named]
     return [sentence for sentence in found if sentence]
-
-
-def _at_rest(urdf: Urdf, joint: Joint) -> list[float]:
-    """Return the place [m] of a joint that no other joint moves, in the frame of the root."""
-    pose = pose_of(joint)
-    for above in urdf.joints_above(joint.parent):
-        pose = pose_of(above) @ pose
-    return pose[:3, 3].tolist()
 
 
 def _outside(what: str, unit: str, bounds: Bounds, values: Iterable[tuple[str, float]]) -> str:

@@ -14,11 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from torchgrasp.app.author.fit_shapes import read_mesh_file
-from torchgrasp.app.author.repair import pose_of
 from torchgrasp.foundation.errors import BadArgument, GraspError
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.limits import HAND_MESH_BYTES, MAX_EXTENT
-from torchgrasp.hand.urdf import LinkShape, Urdf, read_visuals
+from torchgrasp.hand.urdf import LinkShape, Urdf, pose_of, read_visuals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +72,6 @@ def keep_visuals(
     merging. Frames of links that stay are those of the published URDF.
     """
     names = {link.name for link in clean.links}
-    poses = _poses(published)
     meshes = link_meshes(published.path, published.data, folder)
     parts: dict[str, list[Triangles]] = {}
     partial = set[str]()
@@ -88,7 +86,7 @@ def keep_visuals(
             partial.add(owner)
             continue
         vertices, faces = meshes[link]
-        moved = np.linalg.inv(poses[owner]) @ poses[link]
+        moved = np.linalg.inv(published.pose_at_zero(owner)) @ published.pose_at_zero(link)
         corners = vertices @ moved[:3, :3].T + moved[:3, 3]
         parts.setdefault(owner, []).append((corners, faces))
     found = {}
@@ -151,14 +149,3 @@ def _thinned(vertices: np.ndarray, faces: np.ndarray) -> Triangles:
         thin_faces = joined[np.sort(first)]
         cell *= VISUAL.growth
     return thin_vertices, thin_faces
-
-
-def _poses(urdf: Urdf) -> dict[str, np.ndarray]:
-    """Return the pose (4, 4) [m] of each link in the root's frame, with every joint at zero."""
-    found = {}
-    for link in urdf.links:
-        pose = np.eye(4)
-        for joint in urdf.joints_above(link.name):
-            pose = pose_of(joint) @ pose
-        found[link.name] = pose
-    return found

@@ -14,7 +14,7 @@ from torchgrasp.app.author.visuals import link_meshes
 from torchgrasp.app.report.canvas import FINGERS, HAND, sharp_normals
 from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.urdf import LinkShape, read_urdf
+from torchgrasp.hand.urdf import LinkShape, pose_of, read_urdf
 
 PARKED = -1  # finger index of a link that no grasping finger owns, such as the palm
 EDGE = 0.004  # largest radius of a rounded edge [m], about that of a robot finger
@@ -186,5 +186,6 @@ def round_shape(shape: LinkShape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     a, b, c = points[faces].transpose(1, 0, 2)
     inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0.0
     faces[inward] = faces[inward, ::-1]
-    place = trimesh.transformations.euler_matrix(*shape.rpy, axes="sxyz")
-    return points @ place[:3, :3].T + np.array(shape.xyz), faces, normals @ place[:3, :3].T
+    place = pose_of(shape)
+    turn = place[:3, :3].T
+    return points @ turn + place[:3, 3], faces, normals @ turn
