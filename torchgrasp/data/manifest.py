@@ -26,7 +26,7 @@ from torchgrasp.foundation.errors import CloudWarning, DatasetError, TwoBodies
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Count, Seed
 from torchgrasp.foundation.told import warn_user
-from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.geometry.mesh import SUFFIXES, read_mesh
 from torchgrasp.values.planning import PointCloud
 
 # name of the view that shows an object from all sides, with normals: `full_normals.ply`
@@ -40,8 +40,6 @@ largest mass [kg].
 """
 NAME_BYTES = 100  # longest name: file names have 255 bytes
 SHOWN_NAMES = 100  # most names that an error message quotes
-# suffixes of the meshes that `write_objects` takes from a folder
-MESHES = (".ply", ".stl", ".obj", ".off")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,11 +161,11 @@ def write_objects(
     >>> len(read_view(folder / "objects", "carton", "view0"))
     1000
     """
-    files = sorted(path for path in Path(meshes).glob("*") if path.suffix.lower() in MESHES)
+    files = sorted(path for path in Path(meshes).glob("*") if path.suffix.lower() in SUFFIXES)
     names = [path.stem for path in files]
     if not files or len(set(names)) != len(names):
         found = f"{meshes} without meshes" if not files else f"{meshes} with two meshes of one name"
-        allowed = f"a folder of files {', '.join(MESHES)}, each of its own name"
+        allowed = f"a folder of files {', '.join(SUFFIXES)}, each of its own name"
         raise DatasetError("meshes", found, allowed)
     generator = torch.Generator().manual_seed(seed)
     entries = dict[str, object]()
