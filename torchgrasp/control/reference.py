@@ -243,7 +243,7 @@ class ClosingReference(Value):
 
         Raises `BadArgument` for another number of joints, or numbers that are not finite.
         """
-        return torch.minimum(torch.maximum(actuated, self.hand.lower), self.hand.upper)
+        return actuated.clamp(self.hand.lower, self.hand.upper)
 
     @checked
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
@@ -290,7 +290,7 @@ def next_target(
     step = law.joint_step(jacobian, velocity, period, reference.joints - target)
     step = step * min(1.0, fastest * period / max(float(step.abs().max()), law.TINY))
     joints = reference.pick(observation.joints)
-    near = torch.minimum(torch.maximum(target + step, joints - lead), joints + lead)
+    near = (target + step).clamp(joints - lead, joints + lead)
     return reference.clamp(near)
 
 

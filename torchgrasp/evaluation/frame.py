@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.geometry.frames import inverse, rigid
+from torchgrasp.geometry.frames import inverse, rigid, rotate
 from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.geometry.plane import FINE, Plane, to_upright
 from torchgrasp.values.planning import Grasps
@@ -41,7 +41,7 @@ def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
     frame_from_obj = inverse(obj_from_frame)
 
     def turn(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        return rounded(vectors @ frame_from_obj[:3, :3].T)
+        return rounded(rotate(frame_from_obj, vectors))
 
     contacts = dataclasses.replace(
         grasp.contacts,

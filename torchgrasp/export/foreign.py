@@ -400,7 +400,7 @@ def _at_rest(
     """
     still = (wrist - torch.eye(4, dtype=wrist.dtype)).abs().amax((1, 2)) < POSTURE.rounding
     tips = apply(wrist, hand.fingertips(joints)[0])
-    inside = torch.minimum(torch.maximum(joints, hand.lower), hand.upper)
+    inside = joints.clamp(hand.lower, hand.upper)
     reached, left = reach_tips(hand, inside, tips)
     far = (left > POSTURE.same_tip) & ~still
     if bool(far.any()):
@@ -574,5 +574,5 @@ def _open(
     for _ in range(OPENING_STEPS):
         jacobian = hand.jacobian(joints).flatten(1, 2)  # (g, 3 f, h)
         step = damped_inverse(jacobian) @ (OPENED / OPENING_STEPS * away).flatten(1)[..., None]
-        joints = torch.minimum(torch.maximum(joints + step[..., 0], hand.lower), hand.upper)
+        joints = (joints + step[..., 0]).clamp(hand.lower, hand.upper)
     return joints

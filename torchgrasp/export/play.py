@@ -23,7 +23,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.foundation.rules import Positive
-from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane, upright_frame
 from torchgrasp.hand.drives import stiff_drives
@@ -267,7 +267,7 @@ def _describe(
     poses = world_from_obj @ grasps.obj_from_hand
     opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
     rise = (world_from_obj @ opened - poses)[:, :3, 3]
-    far = -spec.approach * (grasps.approach @ world_from_obj[:3, :3].T)
+    far = -spec.approach * rotate(world_from_obj, grasps.approach)
     up = torch.tensor([0.0, 0.0, spec.lift_height], dtype=torch.float64).expand_as(rise)
     # by the phase that ends: displacement of the hand in the world, posture, duration [s]
     motion = {

@@ -242,7 +242,7 @@ def loads_of(
         names = (resist,) if isinstance(resist, str) else resist
         loads = _named_loads(mass)
         force = torch.cat([loads[name] for name in names]).to(center)
-        force = force if table else force @ upright_from_obj[:3, :3].T
+        force = force if table else rotate(upright_from_obj, force)
         torque = torch.zeros_like(force)
         point = center
     return torch.cat([force, torque + torch.linalg.cross(point.expand_as(force), force)], -1)
