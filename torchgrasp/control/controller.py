@@ -155,8 +155,9 @@ class GraspController:
     def status(self) -> Status:
         """Whether the hand can hold the object: `OK`, or `TOO_HEAVY`.
 
-        `TOO_HEAVY` means that the mode "grip" measures more load than the hand can hold. The hand
-        should then set the object down. In other modes the status is always `OK`.
+        `TOO_HEAVY` means that the holding mode "grip" (the argument `holding`) measures more load
+        than the hand can hold. The hand should then set the object down. In other modes the status
+        is always `OK`.
         """
         return self.hold.status if isinstance(self.hold, GripHold) else Status.OK
 
@@ -167,7 +168,7 @@ class GraspController:
 
         A fingertip that sticks bounds the coefficient below; one that slides bounds it above. If
         the plan's coefficients are all out of bounds, the bounds alone count. None unless the hand
-        holds in the mode "grip".
+        holds in the mode "grip" (the argument `holding`).
 
         For example, a plan has a friction of 0.3 to 0.8. A fingertip that sticks with a tangential
         force of half its normal force leaves 0.5 to 0.8, apart from noise.
@@ -178,9 +179,9 @@ class GraspController:
     def mass(self) -> Distribution | None:
         """The `Distribution` of the object's mass [kg], from the load that the fingertips measure.
 
-        None unless the hand holds in the mode "grip" and its load is steady. If the object is too
-        heavy for the hand (`status`), the distribution begins at the mass that was carried. It ends
-        at 10 kg (`WEIGHT.most`).
+        None unless the hand holds in the mode "grip" (the argument `holding`) and its load is
+        steady. If the object is too heavy for the hand (`status`), the distribution begins at the
+        mass that was carried. It ends at 10 kg (`WEIGHT.most`).
         """
         return self.hold.mass if isinstance(self.hold, GripHold) else None
 

@@ -390,8 +390,9 @@ class Reopening:
 class LiftCheck:
     """Check whether a closed hand that rises loses the object.
 
-    Call it at the end of each tick of the lift, with three arguments; it returns `lost`. They are
-    an `Observation`, the height [m] to which the hand has risen, and the tick's length [s].
+    Call it at the end of each tick of the lift, a period of the controller; it returns `lost`. It
+    takes three arguments. The first is an `Observation`. The second is the height [m] of the hand
+    above its place at the start of the lift. The third is the tick's length [s].
 
     `lost` becomes true, and stays so, at the first of two events (bounds: `LOST`):
 

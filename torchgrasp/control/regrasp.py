@@ -166,24 +166,33 @@ class GraspTry:
 
     @property
     def lost(self) -> bool:
-        """Whether the hand detected in the lift that it loses the object (`LiftCheck`)."""
+        """Whether the hand detected in the lift that it loses the object. Its fingertips then no
+        longer touch, or slide too far (`LiftCheck`).
+        """
         return self.check.lost
 
     @property
     def failed(self) -> bool:
-        """Whether the lift has failed: the object is lost, or too heavy for the hand."""
+        """Whether the lift has failed: the object is lost (`lost`), or too heavy for the hand
+        (`controller.status`).
+        """
         return self.lost or self.controller.status is Status.TOO_HEAVY
 
     @checked
     def fails(
         self, observation: Observation, height: Annotated[float, Range(-1.0, 10.0)], period: Period
     ) -> bool:
-        """Return whether the lift has `failed`, and must end. Call it at the end of each tick of
-        the lift.
+        """Return whether the lift has failed and must end: the hand loses the object, or the object
+        is too heavy for it. Call it at the end of each tick, a period of the controller.
+
+        The risen hand loses the object if fewer than two fingertips touch and they carry almost no
+        load. It also loses it if two fingertips slide too far. `LiftCheck` has the bounds. The
+        object is too heavy if the fingertips measure more load than the hand can hold
+        (`GraspController.status`).
 
         Args:
             observation: what the hand measures at the end of the tick (`observe`).
-            height: height [m] to which the hand has risen.
+            height: height [m] of the hand above its place at the start of the lift.
             period: length [s] of the tick, 1e-5 to 1.
 
         Raises `BadArgument` for a period out of range, or a height outside [-1, 10] m.

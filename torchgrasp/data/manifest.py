@@ -240,8 +240,9 @@ def list_views(
 
     Args:
         objects: the folder of objects, as `write_objects` makes it.
-        whole: whether each object has only the view "whole" instead, a cloud of all its sides. Its
-            file, OBJECT/full_normals.ply, is not among those that `write_objects` writes.
+        whole: True lists only the view "whole" of each object, a cloud of all its sides. The user
+            adds its file, OBJECT/full_normals.ply; `write_objects` does not write it. False lists
+            the views that `write_objects` wrote.
         only: names of the objects to list. Empty means all objects.
         most: largest number of views of each object, the first by name. None means all.
 

@@ -53,11 +53,13 @@ class PullSpec(Value):
     """The settings of pulls at a grasped object, and the motion at which a pull fails.
 
     Args:
-        acceleration: force of each pull, divided by the object's mass [m/s^2].
-        seconds: duration [s] of each pull.
-        distance: motion [m] of the object's centre of mass at which a pull fails. It counts from
-            the start of the trial, so it includes the closing.
-        angle: rotation [rad] of the object, counted likewise, at which a pull fails.
+        acceleration: force of each pull, divided by the object's mass [m/s^2], 0 to 1000.
+        seconds: duration [s] of each pull, 0 to 60.
+        distance: motion [m] of the object's centre of mass at which a pull fails, 0 to 10. It
+            counts from the start of the trial, so it includes the closing.
+        angle: rotation [rad] of the object, counted likewise, at which a pull fails; at least 0.
+
+    Raises `BadArgument` for a number outside its range.
     """
 
     acceleration: Annotated[float, Range(0.0, 1000.0)]

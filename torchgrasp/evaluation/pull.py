@@ -58,10 +58,14 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     """Close a hand on the true object, pull at the object, and return whether it stayed in the
     hand.
 
-    The pulls are along -x, +x, -y, +y, -z and +z of the grasp's frame, until one fails. With a
-    `truth.table` the axes are those of a frame on this table. There z is up, and x along the hand's
-    x axis. Every pull starts from the same closed grasp. The object's motion counts from the start
+    A pull fails if the object's centre of mass moves by `distance` [m], or the object turns by
+    `angle` [rad]. Both are fields of the protocol's `PullSpec`. This motion counts from the start
     of the trial, so it includes the closing.
+
+    The pulls are along -x, +x, -y, +y, -z and +z of the grasp's frame, until one fails. This is the
+    frame in which the grasp was planned. With a `truth.table` the axes are those of a frame on this
+    table. There z is up, and x along the hand's x axis. Every pull starts from the same closed
+    grasp.
 
     Args:
         trial: the hand, a single grasp and the true object.

@@ -108,13 +108,16 @@ class ViewScore(Value):
     Attributes:
         object: name of the object.
         view: name of the view; "" if the object could not be read.
-        executable: number of executable grasps that were planned.
-        seconds: CPU time [s] of planning. It is 0 for grasps that were read (`planned`). It is NaN
-            if the object could not be read, or planning did not end.
-        attempts: results of the trials, one for each tried grasp and pose error.
+        executable: number of planned grasps that are executable: they passed all checks.
+        seconds: CPU time [s] of planning. It is 0 for grasps that were read from a file instead
+            (`EvaluationSpec.planned`). It is NaN if the object could not be read, or planning did
+            not end.
+        attempts: results of the trials, one for each tried grasp and each random pose error. A pose
+            error displaces the hand or the object in a trial (`PoseNoise`).
         refusal: `OK` if a grasp is executable; else the most frequent failure of the plan. It is
             `BAD_OBJECT` for bad files or a failed plan. It is `TIMED_OUT` or `WORKER_DIED` if
-            planning did not end. It is `OUT_OF_REACH` if no failure is known.
+            planning did not end. It is `OUT_OF_REACH` if neither the plan nor its file names a
+            failure.
         note: details of the refusal, or "".
         family: name of a family of similar objects, or "".
         group: group of the object, such as "solid", or "".

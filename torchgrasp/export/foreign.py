@@ -109,7 +109,8 @@ def read_foreign(
     """Return joints and poses of grasps from another program's file, or from the JSON of
     `format_grasps`.
 
-    `grasps_from_joints` makes `Grasps` of them.
+    The result has g grasps: `joints` (g, h) [rad or m], `obj_from_hand` (g, 4, 4) [m], and
+    `pregrasp` (g, h) and `table`, or None. `grasps_from_joints` makes `Grasps` of them.
 
     | file | what is read |
     | --- | --- |
@@ -124,25 +125,28 @@ def read_foreign(
     MultiGripperGrasp's `dofs` are the joints with which its simulation starts. Its `final_dofs` and
     `result` are not read.
 
-    Coupled and parked joints of the file may differ from the hand's if this moves no fingertip by
-    over 0.1 mm. A `GraspFileWarning` names values that are not kept, and joints that bend backward.
-    It also tells if an `isaac_grasp` file names no hand in its first line or in the gripper's path.
+    Coupled joints, and joints of fingers that do not grasp, may differ in the file from the hand's.
+    The condition is that this moves no fingertip by over 0.1 mm. A `GraspFileWarning` names values
+    that are not kept, and joints that bend backward. It also tells if an `isaac_grasp` file names
+    no hand in its first line or in the gripper's path.
 
     Args:
-        path: the file. Its angles are in radians.
+        path: the file. Its angles are in radians, and its positions of sliding joints in metres.
         hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are
             known.
         order: the joint, by its name in the hand's URDF, of each number in a posture of the file.
             `JOINT:FACTOR` or `JOINT:FACTOR:OFFSET` converts a number of another sign, unit or zero
-            position [rad]. Numbers under names that the hand does not have are not read. () is for
-            files that name their joints, and for the Allegro hand's files of DexGraspBench.
+            position: the joint is at FACTOR x number + OFFSET [rad, or m for a sliding joint].
+            Numbers under names that the hand does not have are not read. () is for files that name
+            their joints, and for the Allegro hand's files of DexGraspBench.
         quaternion: order of the four numbers after the position in a pose, "wxyz" or "xyzw". Files
             that name their numbers need none.
         unit_m: length [m] of one unit of the positions in the file.
-        root: the hand's frame whose poses the file has. It is a link of the hand's URDF, or the
-            pose (4, 4) [m] of its root link in that frame. "" means the link that the file names
-            (`root_link`, `base_link`, or the end of Isaac's `gripper_frame_link`). If it names
-            none, "" means the hand's root link, or DexGraspBench's frame of the Allegro hand.
+        root: the frame on the hand that the file's poses belong to. It is the name of a link of the
+            hand's URDF. Or it is the pose (4, 4) [m] of the hand's root link in this frame. ""
+            means the link that the file names (`root_link`, `base_link`, or the end of Isaac's
+            `gripper_frame_link`). If it names none, "" means the hand's root link, or
+            DexGraspBench's frame of the Allegro hand.
 
     Raises:
         ModelFileError: the file is missing or malformed, or names another hand, or a root link that

@@ -267,14 +267,16 @@ class Hand(Value):
         joints: Float[Tensor, "*b h"],
         backend: Literal["torchgrasp", "pytorch_kinematics"] = "torchgrasp",
     ) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
-        """Return (points, normals) of the f pads: contact points [m] and outward unit normals.
+        """Return (points, normals) of the f pads, the parts of the fingertips that touch objects:
+        contact points [m] and outward unit normals.
 
-        Both are (*b, f, 3), in the palm's frame.
+        Both are (*b, f, 3), in the palm's frame, that of the hand's root link.
 
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.
-            backend: what computes the poses of the fingertips: "torchgrasp", the tables of `tips`;
-                or "pytorch_kinematics", the hand's `chain`. The results agree up to rounding.
+            backend: what computes the forward kinematics. "torchgrasp" is this library's own, which
+                all other methods use. "pytorch_kinematics" is that package, with the hand's
+                `chain`, as an independent check. The results agree up to rounding.
 
         Raises `BadArgument` for joints of a wrong count, or another `backend`.
         """

@@ -83,7 +83,8 @@ class KinematicTree(Value):
         The last row of each 4 x 4 matrix is left out; `poses` returns whole matrices.
 
         Args:
-            values: positions (j, n) [rad or m] of all j movable joints of the URDF.
+            values: positions (j, n) [rad or m] of all j movable joints of the URDF, in the order of
+                `joint_names`.
             root: poses (3, 4, n) [m] of the root link in another frame, in which the result then
                 is. None means the root's own frame.
         """
@@ -112,7 +113,8 @@ class KinematicTree(Value):
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
         """Return the poses `root_from_link` (n, l, 4, 4) [m] of the l links in n postures.
 
-        `values` (n, j) [rad or m] are positions of all j movable joints of the URDF.
+        Links are in the order of `link_names`, and joints in that of `joint_names`. `values` (n, j)
+        [rad or m] are positions of all j movable joints of the URDF.
         """
         frames = self.frames(values.T.contiguous())
         last = eye_like(4, frames)[3, :, None, None].expand(1, 4, *frames.shape[2:])

@@ -295,14 +295,19 @@ def solve_sliding(
 def solve_joint(
     problem: GraspProblem, seeds: IKSeeds, shape: ShapeLike, spec: ContactSpec
 ) -> Grasps:
-    """Return one checked grasp for each contact set that has initial guesses, the best that was
-    found.
+    """Return the best checked grasp for each contact set that has initial guesses; contacts may
+    move with the hand.
 
-    The guesses of a set are tried in their order. If the hand cannot reach the contacts, they slide
-    along the surface of the `shape`, and are certified again. If the moved contacts fail, the grasp
-    has the `Status` of the contact planner. Executable grasps come first, then those of higher
-    `score`. This score is geometric, at most 0 and without unit. It is no log-odds, so the result's
-    `success` has no meaning.
+    The guesses of a set are tried in their order, first with fixed contacts. If the hand cannot
+    reach the contacts, posture and contacts are solved for together. The contacts then slide along
+    the surface of the `shape`. The moved contacts are checked for force closure again (`certify`).
+    If they violate a constraint on contacts, the grasp has the `Status` of this constraint, as in
+    `ContactPlan`.
+
+    In the result, executable grasps come first: they passed all checks. Others follow. Within both,
+    a higher `score` comes first. This score is a geometric quality, at most 0 and without unit. It
+    is not the log-odds of success that `plan_grasps` gives, so the result's `success` has no
+    meaning.
 
     Args:
         problem: hand, b contact sets and surroundings.

@@ -80,17 +80,22 @@ class PostureLibrary(Value):
     """Random postures of a hand, prepared for a quick comparison with contact sets.
 
     `PostureLibrary.of` makes it, and `nearest_postures` uses it. s counts postures, h actuated
-    joints, f fingertips, and k collision spheres. The fingertips of each posture define a frame,
-    "vf", with the origin at their centroid.
+    joints, f fingertips, and k collision spheres.
+
+    The fingertips of each posture define a virtual frame, "vf", with the origin at their centroid.
+    Its x axis points from the first to the last fingertip. Its z axis is normal to the plane
+    through these two and the centroid of the others (Eqs. 15-17 of the paper).
 
     Attributes:
         hand: the hand.
         joints: actuated joints (s, h) [rad or m].
         vf_from_hand: pose (s, 4, 4) [m] of the hand's root link in the frame vf.
         centres: centres (s, f, 3) [m] of the fingertips, in the frame vf.
-        feature: numbers (s, 6 f) without unit by which postures are compared. They are centres and
-            pad axes of the fingertips in the frame vf, each divided by a scale.
-        spheres: centres (s, k, 3) [m] of the collision spheres, in the hand's frame.
+        feature: numbers (s, 6 f) without unit by which postures are compared. Each fingertip has
+            six: its centre divided by 10 mm (`SEEDS.length_scale`), then its pad's axis divided by
+            0.5 (`SEEDS.cosine_scale`). Both are in the frame vf.
+        spheres: centres (s, k, 3) [m] of the collision spheres, in the frame of the hand's root
+            link.
 
     Raises `BadArgument` for numbers of joints, tips or spheres that are not the hand's.
 

@@ -131,11 +131,12 @@ class FitProgress(Value):
 
     Attributes:
         components: the Gaussians, in standardised dimensions.
-        reseeded: number of times (m,) that each Gaussian collapsed and was placed anew. The
-            likelihood may fall after that.
+        reseeded: number of times (m,) that each Gaussian was placed anew. The reason is a singular
+            covariance, or too few samples. The likelihood may fall after that.
         log_likelihood: mean log-likelihood (t,) [nats] of the standardised data before each step.
-        jumped: whether the likelihood may fall in the next step. It may if a Gaussian was placed
-            anew in the last step, or if the next step uses another subset.
+        jumped: whether the likelihood may fall in the next step. It may if the last step has placed
+            a Gaussian anew. It also may if the next step uses another subset of the samples (the
+            argument `subset` of `fit_mixture`).
         rows: number of samples that the last step used; 0 before the first step.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])

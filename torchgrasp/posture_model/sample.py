@@ -179,9 +179,12 @@ def sample_configurations(
     sampling: Sampling = "uniform",
     observer: Callable[[int], object] = lambda count: None,
 ) -> HandSamples:
-    """Return `n` random postures within the joint limits and without self-collision (Sec. 6.3).
+    """Return `n` random postures within the joint limits and without self-collision, with their
+    contact codes (Sec. 6.3 of the paper).
 
-    With the same `seed` and `sampling`, a smaller `n` gives the first postures of a larger `n`.
+    The result has `joints` (n, h) [rad or m], the positions of the h actuated joints. It also has
+    the contact codes `q` (n, q) of the fingertips, explained in `HandSamples`. With the same `seed`
+    and `sampling`, a smaller `n` gives the first postures of a larger `n`.
 
     Args:
         hand: the hand.
@@ -192,16 +195,17 @@ def sample_configurations(
             "uniform": all without self-collision.
             "grasping": of these, only postures in which contacts at random places on the pads can
               have force closure. It needs a hand with three fingers.
-        observer: function that is called after each chunk of up to 10,000 postures with their
-            number.
+        observer: function that is called after each chunk of up to 10,000 postures, with the number
+            of postures in this chunk.
 
     Raises:
         BadArgument: an argument out of range; "grasping" with another number of fingers.
         BadArgument: a hand of which almost no random posture is kept.
 
     >>> from torchgrasp.hand.load import load_hand
-    >>> sample_configurations(load_hand("barrett"), 100).q.shape
-    torch.Size([100, 6])
+    >>> samples = sample_configurations(load_hand("barrett"), 100)
+    >>> samples.joints.shape, samples.q.shape
+    (torch.Size([100, 4]), torch.Size([100, 6]))
     """
     spec = SampleSpec(n, seed, sampling)
     if sampling == "grasping":

@@ -387,10 +387,12 @@ class Scene(Value):
         The problems are:
 
         * Objects could also stand on another plane than `table`.
-        * Two objects touch, so that the border between them is a guess; not if both are `given`.
-        * An object that is not `given` has a crease: it may be several objects.
-        * The target is not `given`, and has a jump in depth, or is long with gaps in its outline.
-          It may also be several objects.
+        * Two objects touch, so that the border between them is a guess. It is no guess if the user
+          gave the pixels of both (`given`).
+        * An object that the library found has a crease: it may be several objects.
+        * A target that the library found has a jump in depth: it may be several objects.
+        * A target that the library found is long, and has gaps in its outline: it may be several
+          objects.
         * The target is cut off at the border of the image.
         * Another object hides much of the target.
         * The target has `doubts`, so the predicted success is unknown.
@@ -417,9 +419,9 @@ class Scene(Value):
     def doubts(self) -> tuple[str, ...]:
         """Reasons why the target may be several objects, or a part of one, a sentence each.
 
-        They are the sentences of `advice` on creases, on jumps and gaps, and on objects that touch
-        the target. There are none without a target, or for a target that is `given`: its outline is
-        no guess.
+        They are the sentences of `advice` on creases, jumps in depth, gaps in the outline, and
+        touching objects. There are none without a target. There are also none if the user gave the
+        target's pixels (`given`): the outline is then no guess.
         """
         # the search for guesses goes over the whole image
         if self.target is None or self.target in self.given:

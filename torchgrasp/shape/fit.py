@@ -283,9 +283,10 @@ def condition(
     """Return the shape as a Gaussian process posterior, given normalised observations, Eqs. (7)-(9)
     of the paper.
 
-    The result is differentiable, to any order, in the observations, the frame's centre and tensors
-    of the kernel's profile. The domain's radius is a constant, and so is the length psi of a named
-    kernel.
+    `fit_shape` does this for a cloud. Use `condition` for observations of your own, and for
+    gradients with respect to them. The result is differentiable, to any order, in the observations,
+    the frame's centre and tensors of the kernel's profile. Constants are the length psi of a named
+    kernel, and the domain's radius. The domain is the ball in which the posterior is valid.
 
     Args:
         observations: signed distances and normals at n points, with their noise, all normalised.

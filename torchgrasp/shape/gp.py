@@ -115,19 +115,24 @@ class ShapeGP(Posterior, Normalisation):
         psi: Positive,
         std_factor: Positive = 1.0,
     ) -> "ShapeGP":
-        """Return the shape with the observations of `posterior`, whose normalised frame is `frame`.
+        """Return a shape made of a posterior that is already computed, its normalised frame and the
+        seen points.
 
-        Nothing is transformed or computed anew; `condition` makes a shape from observations. The
-        domain's radius is the smaller of two lengths. One is half the kernel's `diameter`. The
-        other is 1.25 (`DOMAIN.reach`) times the greatest distance of an observed point from the
-        centre. The shape's `kind` is "guess".
+        Nothing is transformed or computed anew: `condition` computes a posterior from observations,
+        and `fit_shape` from a cloud.
+
+        The domain is the ball around the frame's centre in which the posterior is valid. Its radius
+        is the smaller of two lengths. One is half the kernel's `diameter`. The other is 1.25
+        (`DOMAIN.reach`) times the greatest distance of an observed point from the centre. The
+        shape's `kind` is "guess": the hidden side is not known from a symmetry.
 
         Args:
-            posterior: another shape, of which the fields `x`, `has_normal`, `weights`, `factor`,
-                `order` and `kernel` are taken.
-            frame: the normalised frame.
+            posterior: the posterior, such as another shape. Its observations and its kernel are
+                taken: `x`, `has_normal`, `weights`, `factor`, `order` and `kernel`.
+            frame: the normalised frame of the posterior's points.
             cloud: the seen points [m], in the frame of `frame.center`.
-            psi: the kernel's length, normalised.
+            psi: length of the posterior's kernel, normalised. It does not change the kernel.
+                Batches of shapes with thin plate kernels are evaluated with it.
             std_factor: ratio of the surface's true deviations to the posterior's standard
                 deviations.
 
@@ -317,11 +322,12 @@ class ShapeGP(Posterior, Normalisation):
         """Return the shape given m more surface points, such as a finger's touch or a second view.
 
         The result equals the posterior given the earlier and the new observations at once. Kernel,
-        domain and `cloud` do not change.
+        `cloud` and the domain, the ball in which the posterior is valid, do not change.
 
         20 or more points (`VIEWS.least`) count as a view, which is compared with `cloud` if `cloud`
         has normals. The view's pose is in error if noise does not explain its distance from
-        `cloud`. Then `MendedInput` warns, and all standard deviations grow by this error.
+        `cloud`. `MendedInput` then warns. The standard deviation [m] of this pose error is included
+        in those of the new points. It is also included in all that the shape predicts (`widened`).
 
         Args:
             points: surface points (m, 3) [m] in the cloud's frame.

@@ -115,8 +115,9 @@ class HollowShape(ShapeGP):
     def mean(self, x: Queries) -> Float[Tensor, "q"]:
         """Return the mean signed distance (q,) at q points `x` (q, 3) that `normalise` returned.
 
-        The greater of the distances from the two surfaces: positive outside and in the cavity,
-        negative in the wall. It is normalised: one unit is `scale` [m].
+        It is the greater of two signed distances, from the outer and from the `inner` surface. So
+        it is positive outside the vessel and in its cavity, and negative in the wall. It is
+        normalised: one unit is `scale` [m].
         """
         return torch.maximum(self.outer.mean(x), self.inner.mean(x))
 

@@ -68,7 +68,8 @@ class Formula(partial[Any]):
 @dataclasses.dataclass(frozen=True)
 class Kernel:
     """A radial kernel: the covariance k(r) of the signed distances at two points a normalised
-    distance r apart. One normalised unit is `ShapeGP.scale` [m].
+    distance r apart. One normalised unit is `ShapeGP.scale` [m], and k has squared normalised
+    units.
 
     Use `thin_plate_kernel`, `matern52_kernel` or `rbf_kernel`, or your own profile. `fit_shape` and
     `condition` take a kernel. With `condition`, gradients also flow to tensors that the profile
@@ -81,9 +82,12 @@ class Kernel:
             is positive definite everywhere.
         remedy: advice in the text of the error that is raised if the covariance is not positive
             definite.
-        closed_form: function of `r` and `count` that returns the results of `derivatives` faster
-            than autograd of the profile. False means autograd. Where a gradient is needed, autograd
+        closed_form: function of distances `r` and a number `count` that returns what `derivatives`
+            returns, but faster. This is a tuple of the first `count` of k, k1, k2, k3, each in the
+            shape of `r`. False means autograd of the profile. Where a gradient is needed, autograd
             is used in any case.
+
+    Raises `BadArgument` for a `diameter` that is not positive.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
     >>> [round(float(s), 4) for s in kernel.derivatives(torch.ones(1, dtype=torch.float64), 4)]

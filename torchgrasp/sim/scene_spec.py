@@ -106,7 +106,8 @@ class SceneSpec:
     """Parameters of a simulated scene: a hand, the object, the table and neighbours.
 
     `open_scene` takes it. Everything is in the world's frame, with z up. The hand is carried by a
-    mount: a chain of driven prismatic joints in place of an arm.
+    mount: a chain of driven prismatic joints in place of an arm. They lift the hand, move it along
+    its approach, and shift it along the axes of the world.
 
     Args:
         urdf_path: URDF of the hand.
@@ -131,9 +132,11 @@ class SceneSpec:
             vector is less than the offset. None means that the table does not end.
         neighbours: other bodies on the table, each a `Body`.
         self_pairs: names of the two links of each pair of the hand's links that can collide.
-        yields: largest displacement [m] of the mount along each axis of the world, beside approach
-            and lift; 0 allows none.
-        start: initial displacement (x, y, z) [m] of a mount that `yields`.
+        yields: largest displacement [m] by which `SimulatedScene.shift` can move the mount along
+            each axis of the world. It adds to approach and lift. 0 means that the mount cannot
+            shift.
+        start: initial displacement (x, y, z) [m] of the mount by such a shift; without effect if
+            `yields` is 0.
         table_friction: friction coefficient of objects with the table and with each other; None
             means `friction`.
         mount: all prismatic joints of the mount, each a `Slide`, from the world to the hand. None

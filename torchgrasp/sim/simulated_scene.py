@@ -187,11 +187,11 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) of one point on each fingertip with respect to the driven
-        joints.
+        """Return the Jacobian (f, 3, j) of one point on each fingertip with respect to the j driven
+        joints: the movable joints of the hand's URDF, not those of the mount.
 
-        Points and result are in the world's frame. The unit is [m/rad]; columns of sliding joints
-        have none.
+        Points and result are in the world's frame. The columns are in the order of `joint_names`.
+        Their unit is [m/rad]; columns of joints that slide have none.
 
         Args:
             points: a point (f, 3) [m] on each fingertip.
@@ -271,14 +271,21 @@ class SimulatedScene(abc.ABC):
             raise BadArgument("mount", f"no joint {joint}", allowed) from None
 
     def neighbour_poses(self) -> np.ndarray:
-        """Return the poses (m, 4, 4) [m] of the m neighbours in the world's frame.
+        """Return the rigid transform of each of m neighbours since the start, (m, 4, 4) [m], in the
+        world's frame.
 
-        They are in the order of `SceneSpec.neighbours`. A body has the identity at its start.
+        They are in the order of `SceneSpec.neighbours`. A transform takes the points of a body's
+        mesh from the initial to the present place. So it is the identity at the start.
         """
         return np.array([self._pose(body) for body in self.neighbours]).reshape(-1, 4, 4)
 
     def object_pose(self) -> np.ndarray:
-        """Return the object's pose (4, 4) [m] in the world's frame; the identity at the start."""
+        """Return the rigid transform (4, 4) [m] that has moved the object since the start, in the
+        world's frame.
+
+        It takes the points of the object's mesh from the initial to the present place. So it is the
+        identity at the start.
+        """
         return self._pose(self.body)
 
     def hand_pose(self) -> np.ndarray:

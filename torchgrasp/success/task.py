@@ -89,11 +89,13 @@ class GraspTask(Value):
 
     @checked
     def pressing(self, lifted: bool) -> float:
-        """Return the normal force [N] of the strongest finger.
+        """Return the normal force [N] of the strongest finger; 0 if the measured load is to set it.
 
-        This is the field `force`. If that is None, it is 4 N in pulls and 0 in a lift. In a lift
-        the hand presses as much as the measured load requires. `lifted` says whether the task is a
-        lift, as `lifts` returns it.
+        The result is the field `force`, if `force` is not None. Otherwise it is 0 for a lift, in
+        which the hand presses as much as the measured load requires. For pulls at a floating object
+        it is 4 N.
+
+        `lifted` says whether the task is a lift, as `lifts` returns it; False means pulls.
         """
         return self.force or (0.0 if lifted else 4.0)
 

@@ -212,8 +212,9 @@ class ContactPlan(Batch):
 
     Attributes:
         contacts: the contact sets, also those that violate a constraint.
-        coefficients: weights phi (b, f, e) of the edges of the friction cones, without unit and
-            with sum 1 (Eq. 13). At these weights the forces of a closed set balance.
+        coefficients: weights phi (b, f, e) of forces along the edges of the friction cones, without
+            unit (Eq. 13 of the paper). The weights of a set have the sum 1, over all its fingertips
+            and edges. If the set has force closure, these forces balance.
         quality: distance (b,) [m] of the contacts' centroid from the cloud's centre (Eq. 14); less
             is better.
         status: `Status` code (b,) of each set: `OK`, or the first constraint that the set violates.
