@@ -39,7 +39,8 @@ class CampaignSpec(Value):
         protocol: the protocol by which each grasp is tried in simulation, or its name in
             `torchgrasp.evaluation.PROTOCOLS`. An unknown name raises `BadArgument` in `test` and in
             `run_campaign`, not here.
-        trials: which views are planned on, and how many of their grasps are tried.
+        trials: which views are planned on, and how many of their grasps are tried
+            (`torchgrasp.evaluation.EvaluationSpec`).
         licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
         jobs_in_shard: number of jobs in one file. A job is one view of one object.
         device: "cpu", or "cuda" to plan on all views of a file at once. "cuda" needs a Dask cluster
@@ -102,9 +103,9 @@ def run_campaign(
     object. Each job gives a `JobRow` and its grasps; without grasps the row says why. A finished
     job is on disk at once.
 
-    The same call continues an interrupted run. It also repeats the jobs that ended with
-    `WORKER_DIED`, `TIMED_OUT` or `BROKEN`. The files do not depend on the number and order of
-    workers, nor on interruptions (docs/promises.md, N10).
+    The same call continues an interrupted run. It also repeats the jobs whose work did not end:
+    those with the status `WORKER_DIED`, `TIMED_OUT` or `BROKEN`. The files do not depend on the
+    number and order of workers, nor on interruptions (docs/promises.md, N10).
 
     Args:
         objects: folder of objects with its manifest, as `write_objects` makes it. On a cluster it

@@ -104,7 +104,8 @@ def partial_view(
     640 x 480 pixels.
 
     By default the noise is that of an active stereo camera. It has noisy and rounded disparities, a
-    smooth bias, and flying and missing pixels at rims. Pixels are also missing at grazing angles.
+    smooth bias, and flying and missing pixels at rims, where the depth jumps. Pixels are also
+    missing at grazing angles.
 
     Args:
         mesh: surface of the object [m].

@@ -101,8 +101,8 @@ class SensorNoise(Value):
     faults.
 
     The faults are flying and missing pixels at rims, missing pixels at grazing angles, and errors
-    in corners. A stereo camera measures the disparity f b / depth [px], with focal length f [px]
-    and baseline b [m].
+    in corners. A rim is an outline at which the depth jumps. A stereo camera measures the disparity
+    f b / depth [px], with focal length f [px] and baseline b [m].
 
     Args:
         base: f b [px m] of a stereo camera; 0 means a time-of-flight camera.

@@ -56,12 +56,15 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     """Return whether each of b contact sets has frictional form closure (Eq. 13 of the paper), with
     a proof in float64.
 
-    The answer is `Certificate.closed`. The wrenches w of a set are forces along the edges of its
-    friction cones, with their torques. They are the columns of W. Coefficients phi with W phi = 0
-    and sum phi = 1 balance them. The margin is the largest s with phi >= s for such a phi, or -inf
-    without one. A set is `closed` if its margin is at least 1e-6 (`MIN_MARGIN`) and its
-    `rank_ratio` at least 1e-3 (`MIN_RANK_RATIO`). In addition, its contacts must not lie almost on
-    a line, and phi must balance W up to rounding.
+    The answer is `Certificate.closed`. Frictional form closure is also called force closure. The
+    contacts then resist any load if the fingers press hard enough.
+
+    The wrenches w of a set are forces along the edges of its friction cones, with their torques.
+    They are the columns of W. Coefficients phi with W phi = 0 and sum phi = 1 balance them. The
+    margin is the largest s with phi >= s for such a phi, or -inf without one. A set is `closed` if
+    its margin is at least 1e-6 (`MIN_MARGIN`) and its `rank_ratio` at least 1e-3
+    (`MIN_RANK_RATIO`). In addition, its contacts must not lie almost on a line, and phi must
+    balance W up to rounding.
 
     If a set is not closed, its `witness` is a unit wrench v that no contact force opposes. For
     every edge wrench w then v . w >= 0, up to rounding. If only the rank is too low, the wrenches

@@ -286,8 +286,8 @@ def closure_probability(
     Args:
         shape: the uncertain shape, from `fit_shape`.
         contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals, in the frame of
-            the shape's cloud. They must lie in the domain of the shape, at least 12 mm
-            (`FOOTPRINT`) from its edge.
+            the shape's cloud. They must lie in the shape's domain, the ball in which its posterior
+            is valid. Their distance from its edge must be at least 12 mm (`FOOTPRINT`).
         spec: its `friction` is used, the coefficient of friction at execution; `planned_friction`
             is not used. For a distribution the result is the mean over 9 frictions (`FRICTIONS`).
             None means `ContactSpec()`.

@@ -144,8 +144,9 @@ class GraspController:
     def closed(self) -> bool:
         """Whether the hand has closed and pressed long enough, so that it may be lifted.
 
-        If another attempt is allowed, the grasp must also seem strong enough to lift the object. In
-        the mode "open_loop" it is true at the end of the motion.
+        If another attempt is allowed (`ClosingOptions.attempts`), the grasp must also seem strong
+        enough to lift the object. In the closing mode "open_loop" it is true at the end of the
+        motion.
         """
         if not self.closing.feels:
             return self.closing.done
@@ -187,8 +188,8 @@ class GraspController:
 
     @property
     def blend(self) -> Float[Tensor, " f"]:
-        """The share of force control (f,) of each finger at the last tick, from 0 to 1. It is
-        lambda in Eq. (26) of the paper.
+        """The share of force control (f,) of each finger at the last tick: 0 means position control
+        alone, 1 force control alone. It is lambda in Eq. (26) of the paper.
 
         It is NaN while the control law of Eq. (25) does not command the fingers. This is always so
         in closing modes without this law. In modes with it, this is so before the first tick, in
@@ -203,9 +204,9 @@ class GraspController:
     def displacement(self) -> Float[Tensor, "4 4"]:
         """The displacement (4, 4) [m] of the object, as estimated from the touches.
 
-        A rigid transform in the frame of the planned hand, from the planned to the present object.
-        It is the identity before any touch, and if the pose is not estimated
-        (`ClosingOptions.pose_estimate`).
+        It is a rigid transform from the planned to the present object. Its frame is that of the
+        hand's root link at the planned pose. It is the identity before any touch, and if the pose
+        is not estimated (`ClosingOptions.pose_estimate`).
         """
         closing = self.closing
         if not isinstance(closing, UncertaintyClosing):
@@ -220,7 +221,8 @@ class GraspController:
         """The motion (4, 4) [m] of the object since the plan, estimated from a new view (`relook`)
         and from touches.
 
-        A rigid transform in the frame of the grasp, from the planned to the present object.
+        It is a rigid transform from the planned to the present object. Its frame is that of the
+        planned cloud.
         """
         straight = torch.eye(3, dtype=torch.float64)
         placed = self.planned.obj_from_hand @ rigid(straight, self.path)
@@ -228,13 +230,14 @@ class GraspController:
 
     @checked
     def relook(self, cloud: PointCloud) -> None:
-        """Shift the approach so that it ends at the object as a new view shows it.
+        """Shift the approach, the straight path to the pre-grasp, to the object as a new view shows
+        it.
 
         Call it before the first `step`. Then move the hand by `targets.palm` [m], where the shifted
         approach begins. The palm does not rotate: the contacts of a turned object are found by
         touch.
 
-        `cloud` holds points [m] of the object alone, in the frame of the grasp. Raises
+        `cloud` holds points [m] of the object alone, in the frame of the planned cloud. Raises
         `BadArgument` if the hand has no approach, or has begun it.
         """
         reference = self.planned
@@ -253,7 +256,7 @@ class GraspController:
 
     @checked
     def step(self, observation: Observation, period: Period) -> Targets:
-        """Return the targets of joints and palm for the next tick.
+        """Return the targets of joints and palm for the next tick, the time until the next call.
 
         In the tick in which the closing ends, the targets do not change: this tick only prepares
         the hold.

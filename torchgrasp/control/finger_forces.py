@@ -106,7 +106,8 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
     The result has three fields, for g grasps, h actuated joints and f fingertips:
 
     * `joints` (g, h) [rad or m]: targets of the actuated joints, which may exceed their limits.
-    * `forces` (g, f, 3) [N]: balanced forces of the fingertips on the object, in the hand's frame.
+    * `forces` (g, f, 3) [N]: balanced forces of the fingertips on the object, in the frame of the
+      hand's root link.
     * `torques` (g, h) [N m or N]: efforts of the actuated joints that exert these forces.
 
     The targets solve J^T f = K (target - q). Here q are the joints of the grasp, f the forces,

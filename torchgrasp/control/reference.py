@@ -36,10 +36,10 @@ from torchgrasp.values.specs import ContactSpec
 class ClosingReference(Value):
     """The plan for closing a hand on one grasp.
 
-    `from_grasp` makes it. f counts fingertips, h actuated joints, and j all joints of the URDF.
-    Vectors and the table are in the frame of the planned hand: that of its root link at
-    `obj_from_hand`. Only `surface` is in the frame of the grasp. Joints that slide have [m] in
-    place of [rad], and their drives [N/m].
+    `from_grasp` makes it, and a `GraspController` follows it. f counts fingertips, h actuated
+    joints, and j all joints of the URDF. Vectors and the table are in the frame of the planned
+    hand: that of its root link at `obj_from_hand`. Only `surface` is in the frame of the grasp,
+    that of the planned cloud. Joints that slide have [m] in place of [rad], and their drives [N/m].
 
     Args:
         hand: the hand, in float64.
@@ -51,8 +51,9 @@ class ClosingReference(Value):
         squeeze: targets (h,) [rad or m] of the actuated joints that press on the object without
             feedback, from `torchgrasp.control.squeeze`.
         normals: outward unit normals (f, 3) of the planned contacts.
-        gains: targets, controller gains and desired forces of the closing "uncertainty"
-            (`ClosingGains`). `as_printed` returns a plan with those of the closing "paper".
+        gains: targets, controller gains and desired forces of the closing mode "uncertainty"
+            (`ClosingGains`). `as_printed` returns a plan with those of the mode "paper".
+            `TrialSpec` explains the modes.
         approach: unit vector (3,) along which the opened hand moves to its pre-grasp; None means no
             approach.
         table: the table, which no fingertip enters while it searches; None if it is unknown.
@@ -62,7 +63,7 @@ class ClosingReference(Value):
         sensor: sensors of the fingertips.
         max_force: largest normal force [N] of a fingertip; None means no limit.
         distance_variance: variance (f,) [m^2] of the signed distance at each contact (f_cov in Eq.
-            12 of the paper). The closing "paper" needs it. None if it is unknown.
+            12 of the paper). The closing mode "paper" needs it. None if it is unknown.
         friction: coefficient of friction that the grasp was planned for, or its `Distribution`.
     """
 
@@ -92,7 +93,8 @@ class ClosingReference(Value):
         kp: Positive | None = None,
         stability: finger_forces.ForcePreference | None = None,
     ) -> "ClosingReference":
-        """Return the closing plan of one grasp, in float64 on the CPU.
+        """Return the closing plan of one grasp, which a `GraspController` follows, in float64 on
+        the CPU.
 
         Its `table` and `surface` are None, and its `sensor` is the default. Set them with
         `dataclasses.replace`.
@@ -174,7 +176,7 @@ class ClosingReference(Value):
 
     @checked
     def as_printed(self) -> "ClosingReference":
-        """Return the same plan with the gains of the closing "paper".
+        """Return the same plan with the gains of the closing mode "paper" (`TrialSpec`).
 
         In `gains`, `covariance` and `position_gain` become those of Eqs. (26) and (27) as the paper
         prints them. Raises `BadArgument` if `distance_variance` is None.
@@ -344,10 +346,11 @@ def closing_gains(
     force: Force = 4.0,
     stability: finger_forces.ForcePreference | None = None,
 ) -> ClosingGains:
-    """Return the target, gains and desired force of each finger for one grasp, in the hand's frame.
+    """Return the target, gains and desired force of each finger for one grasp.
 
-    The gains are those of the closing "uncertainty"; `ClosingReference.as_printed` has those that
-    the paper prints.
+    They are in the frame of the hand's root link at the planned pose. The gains are those of the
+    closing mode "uncertainty" (`TrialSpec`). `ClosingReference.as_printed` has those that the paper
+    prints.
 
     Args:
         grasp: a single grasp, such as `grasps[0]`.

@@ -104,7 +104,8 @@ class GraspTry:
 
     The robot goes through these steps:
 
-    1. Move the hand to `obj_from_hand`, and call `controller.step` until `controller.closed`.
+    1. Move the hand to `obj_from_hand`, and call `controller.step` until `controller.closed`. Each
+      call is a tick, a period of the controller.
     2. Lift the hand. Go on calling `controller.step`, then `fails`, at each tick.
     3. If the lift fails, lower the hand, send the targets of `withdraw`, and go on with `next`.
 

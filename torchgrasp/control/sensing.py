@@ -44,7 +44,8 @@ ALONG_STD = 3.0
 
 @checked
 def feel_flags(tactile: TactileState, touching: Bool[Tensor, "f"]) -> TactileState:
-    """Return the tactile state of f fingertips that sense only whether they touch.
+    """Return the tactile state, readings and filters, of f fingertips that sense only whether they
+    touch.
 
     The `reading` of a fingertip that touches is 0.3 N (`WAITING_FORCE`), that of any other one 0.
     Contact points and normals are NaN.
@@ -71,7 +72,8 @@ def feel_torques(
     torques: Float[Tensor, " j"],
     period: Positive,
 ) -> TactileState:
-    """Return the tactile state of f fingertips whose forces are estimated from joint torques.
+    """Return the tactile state, readings and filters, of f fingertips whose forces are estimated
+    from joint torques.
 
     j counts all joints of the URDF. Contact points and normals of the state are NaN.
 

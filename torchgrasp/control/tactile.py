@@ -53,7 +53,8 @@ TACTILE = TactileNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class TipContact(Value):
-    """True contacts of f fingertips, averaged over a tick, in the hand's frame.
+    """True contacts of f fingertips, averaged over a control tick, in the frame of the hand's root
+    link.
 
     A simulator makes it for `measure` or a `FingertipSensor`. All tensors may have further leading
     axes `*b`, the same for all.
@@ -77,7 +78,8 @@ class TipContact(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class TactileState(Value):
-    """Readings of f fingertips in the hand's frame, and the state of their filters.
+    """Readings of f fingertips in the frame of the hand's root link, and the state of their
+    filters.
 
     `no_contact` returns the first one. `measure`, `feel_flags` or `feel_torques` then return one at
     each tick. All tensors may have further leading axes `*b`, the same for all.
@@ -109,7 +111,8 @@ class TactileState(Value):
 
 @checked
 def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -> TactileState:
-    """Return the tactile state of fingertips that touch nothing, the first state of a closing.
+    """Return the tactile state, readings and filters, of fingertips that touch nothing: the first
+    state of a closing.
 
     Forces are 0, contact points and normals NaN, in float64 on the CPU. The fingertips are sampled
     at the next tick.
@@ -142,17 +145,17 @@ def measure(
     generator: torch.Generator | None = None,
     noise: Annotated[float, Range(0.0, 100.0)] = 1.0,
 ) -> TactileState:
-    """Return the simulated tactile state one tick later, with lag, noise and sampling of the
-    sensors.
+    """Return the simulated tactile state, readings and filters, one control tick later, with lag,
+    noise and sampling of the sensors.
 
-    Vectors are in the hand's frame. f counts fingertips, and `*b` stands for leading axes that all
-    tensors share.
+    Vectors are in the frame of the hand's root link. f counts fingertips, and `*b` stands for
+    leading axes that all tensors share.
 
     Args:
         tactile: the state at the last tick; `no_contact` returns the first one.
         truth: true contacts in this tick.
-        pads: outward unit normals (*b, f, 3) of the surface at the planned contacts. They direct
-            the noise of tips that touch nothing.
+        pads: outward unit normals (*b, f, 3) of the object's surface at the planned contacts. They
+            direct the noise of tips that touch nothing.
         radius: radius (f,) [m] of the tips. 0 means that a tip is not round; then 12 mm
             (`TACTILE.radius`) is assumed.
         period: length [s] of the tick.

@@ -80,7 +80,8 @@ def close_hand(
     """Close a hand on the true object, lift it and hold it, in simulation; return the record.
 
     The opened hand moves straight to its pre-grasp, closes and presses (`GraspController`), rises
-    and holds. The object is **held** if three conditions are met:
+    and holds. The frame of the grasp, in which poses are given, is that of the planned cloud. The
+    object is **held** if three conditions are met:
 
     * its centre rose by at least half of the lift's height;
     * at least two fingers touch it at the end;

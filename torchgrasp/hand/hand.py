@@ -92,7 +92,7 @@ class Hand(Value):
             independent. `tree` and `tips` are compiled from its tensors, so do not change it in
             place.
         tree: the kinematic tree: names of links and joints, and forward kinematics.
-        tips: the fingertips and their pads.
+        tips: the fingertips and their pads, the parts that touch objects.
         approach: unit vector (3,) out of the palm, along which the hand approaches objects.
         actuators: the drive of every movable joint of the URDF, by the joint's name.
         collision_spheres: spheres that cover the links.

@@ -72,7 +72,7 @@ class ShapeGP(Posterior, Normalisation):
         order: index (r,) in `weights` of each row of `factor`; None if both have the same order.
         kernel: the `Kernel`, the covariance of the signed distances at two points.
         center: origin (3,) [m] of the normalised frame, in the cloud's frame.
-        scale: length [m] of one normalised unit.
+        scale: length [m] of one normalised unit, about the object's radius.
         psi: the kernel's length psi, normalised.
         domain_radius: radius, normalised, of the domain: the ball around `center` in which the
             posterior is valid.
@@ -207,9 +207,10 @@ class ShapeGP(Posterior, Normalisation):
         With `covariance=False` the estimate's `covariance` is None, and the rest is the same up to
         rounding. The call is then faster: it multiplies one row for each point instead of four.
 
-        Points outside the domain, up to twice `domain_radius` from `center`, get a guess. There the
-        distance grows outward with slope 1, from the distance at the nearest point of the domain.
-        Covariance and `std_m` are the prior's.
+        The domain is the ball in which the posterior is valid. Points outside it, up to twice
+        `domain_radius` from `center`, get a guess. There the distance grows outward with slope 1,
+        from the distance at the nearest point of the domain. Covariance and `std_m` are the
+        prior's.
 
         Raises `BadArgument` for numbers that are not finite, and for points farther than twice
         `domain_radius` from `center`. Inside torch.vmap neither is checked.
@@ -240,8 +241,8 @@ class ShapeGP(Posterior, Normalisation):
         The points are in the cloud's frame. The derivatives are per metre, with the dtype of
         `points`. b stands for any batch axes.
 
-        Raises `BadArgument` for numbers that are not finite, and for points outside the domain,
-        where `predict` gives a guess.
+        Raises `BadArgument` for numbers that are not finite, and for points outside the domain. The
+        domain is the ball in which the posterior is valid; outside, `predict` gives a guess.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> view = load_object("jug").view
@@ -271,8 +272,9 @@ class ShapeGP(Posterior, Normalisation):
         It has the covariances of different points, which `predict` leaves out. The result is
         normalised: one unit is `scale` [m]. It has the dtype of `points`.
 
-        Raises `BadArgument` for numbers that are not finite, points outside the domain, or more
-        than 1000 points (`DOMAIN.joint`).
+        Raises `BadArgument` for numbers that are not finite, or more than 1000 points
+        (`DOMAIN.joint`). It is also raised for points outside the domain, the ball in which the
+        posterior is valid (`contains`).
         """
         x = self._queries(points)
         if len(x) > DOMAIN.joint:
@@ -390,8 +392,9 @@ class ShapeGP(Posterior, Normalisation):
         """Return the shape given further observations in its normalised frame, in addition to all
         earlier ones.
 
-        Kernel, domain and `cloud` do not change. `update` does the same for points [m]. Raises
-        `IndefiniteCovariance` for observations too far outside the domain.
+        Kernel, `cloud` and the domain do not change. The domain is the ball in which the posterior
+        is valid. `update` does the same for points [m]. Raises `IndefiniteCovariance` for
+        observations too far outside the domain.
         """
         return dataclasses.replace(self, **common_fields(append_observations(self, new), Posterior))
 

@@ -204,9 +204,9 @@ class HollowShape(ShapeGP):
     def append(self, new: Observations) -> "HollowShape":
         """Return the vessel given further observations in its normalised frame.
 
-        Each observation changes the surface, outer or inner, that applies at its point
-        (`wall_at`). Its distance and normal are those from that surface. Raises
-        `IndefiniteCovariance` for observations too far outside the domain.
+        Each observation changes the surface, outer or inner, that applies at its point (`wall_at`).
+        Its distance and normal are those from that surface. Raises `IndefiniteCovariance` for
+        observations too far outside the domain, the ball in which the posterior is valid.
         """
         outer, inner = self.wall_at(new.x).T
         new_outer = self.outer.append(new[outer])

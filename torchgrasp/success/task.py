@@ -35,7 +35,8 @@ class GraspTask(Value):
             means a lift if the planner knows the table and the closing is not "open_loop".
         closing: how the hand closes.
             "uncertainty": by touch.
-            "open_loop": without sensors, from pre-grasp to grasp to squeeze.
+            "open_loop": without sensors, from pre-grasp to grasp to squeeze. The squeeze is joint
+              targets with which the fingers press.
         displaced: whether the object may have moved since the camera saw it: by up to 30 mm along
             the table, or by up to 5 mm and 5 degrees in pulls.
 

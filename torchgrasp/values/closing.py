@@ -127,7 +127,8 @@ class ClosingTrace(Value):
 class ClosureResult(Value):
     """The result of closing a hand on the true object in simulation, recorded at t control ticks.
 
-    `close_hand` returns it. f counts fingertips, and j all joints of the URDF. Numbers that were
+    `close_hand` returns it. A control tick is a period of the controller. f counts fingertips, and
+    j all joints of the URDF. The frame of the grasp is that of the planned cloud. Numbers that were
     not measured before the trial ended are NaN. Poses are rigid transforms [m]. Joints that slide
     have [m] in place of [rad].
 
@@ -169,9 +170,9 @@ class ClosureResult(Value):
         friction: `Distribution` of the coefficient of friction. It is the planned distribution,
             limited to the interval that sticking and sliding fingertips allow. If the plan excludes
             this interval, the distribution follows from the touches alone. None if the hand did not
-            hold in the mode "grip".
+            hold in the mode "grip" (`TrialSpec.holding`).
         mass: `Distribution` of the object's mass [kg], from the load that the hand measured while
-            nothing pushed at the object. None if the mode "grip" measured no steady load.
+            nothing pushed at the object. None if the holding mode "grip" measured no steady load.
     """
 
     held: bool
@@ -208,7 +209,8 @@ SensorKind = Literal["tactile", "torque", "binary"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingOptions(Value):
-    """Options of the closing modes "uncertainty" and "fixed", which extend the paper's control law.
+    """Options of the closing modes "uncertainty" and "fixed" (`TrialSpec`), which extend the
+    paper's control law.
 
     Args:
         wait: whether a finger that touches waits for the others, so that all press together.

@@ -231,10 +231,11 @@ class ContactPlan(Batch):
 class Certificate(Batch):
     """Whether each of b contact sets has frictional form closure (Eq. 13), with a proof.
 
-    `certify` returns it, and `closed` is the answer. f counts the fingertips of a set. The wrenches
-    w of a set are the columns of W. They are forces along the edges of its friction cones, then
-    their torques. Torques are about the contacts' centroid. They are divided by the contacts'
-    root-mean-square distance from it, so wrenches have no unit.
+    `certify` returns it, and `closed` is the answer. Frictional form closure is also called force
+    closure. The contacts then resist any load if the fingers press hard enough. f counts the
+    fingertips of a set. The wrenches w of a set are the columns of W. They are forces along the
+    edges of its friction cones, then their torques. Torques are about the contacts' centroid. They
+    are divided by the contacts' root-mean-square distance from it, so wrenches have no unit.
 
     Attributes:
         closed: mask (b,) of the sets that have force closure. Their margin is at least 1e-6 and
@@ -374,12 +375,14 @@ class Grasps(Batch):
         clearance: least distance (g,) [m] of the links from the estimated surface, from each other
             and from the table. It is negative where they overlap. Fingertips may touch the surface.
         normal_angle: angle (g, f) [rad] between the axis of a fingertip's pad and the inward normal
-            of the object at its contact.
-        certificate: proof of force closure (g rows).
-        score: log-odds (g,) of the predicted success (no unit). Executable grasps are in the order
-            of their scores, unless the argument `ranking` of `plan_grasps` is "variance". The score
-            of a failed grasp is no log-odds and says nothing about success.
-        status: `Status` code (g,): `OK` for an executable grasp, else the reason why it failed.
+            of the object at its contact. The pad is the part that touches objects.
+        certificate: proof of force closure (g rows): whether the contacts resist any load.
+        score: log-odds (g,) of the predicted success p, log(p / (1 - p)) without unit. Executable
+            grasps are in the order of their scores, unless the argument `ranking` of `plan_grasps`
+            is "variance". The score of a failed grasp is no log-odds and says nothing about
+            success.
+        status: `Status` code (g,): `OK` for an executable grasp, which passed all checks. Else it
+            is the reason why the grasp failed.
         meta: names, units, hashes and the seed of the plan, as text.
         known: mask (g,) of the grasps that are like those of the trials to which the success model
             was fitted. The success of other grasps is unknown. None means that all are known.
@@ -434,7 +437,8 @@ class Grasps(Batch):
 
     @property
     def best(self) -> "Grasps":
-        """The first executable grasp, as a batch of one, which all functions take.
+        """The first executable grasp, one that passed all checks, as a batch of one, which all
+        functions take.
 
         `best.joints[0]` are its joints [rad or m], without the axis of the batch.
         `float(best.success)` is a number. Raises `FailedRows` with the reasons if there is no
@@ -466,8 +470,9 @@ class Grasps(Batch):
         """Return a sheet for notebooks: a table of up to five executable grasps, and a picture of
         the first.
 
-        A notebook shows both, and `print` shows the table. The attribute `picture` of the sheet
-        holds the picture as PNG; it is None if no grasp is executable.
+        Executable grasps passed all checks. A notebook shows both, and `print` shows the table. The
+        attribute `picture` of the sheet holds the picture as PNG; it is None if no grasp is
+        executable.
 
         Args:
             cloud: the cloud of the object, in any form that `plan_grasps` takes. With it the

@@ -51,8 +51,9 @@ class ContactSpec(Value):
         edges: number of edges of the linearised friction cone, at least 3.
         max_variance: largest variance of the signed distance at a contact, S_thresh of Eq. (12), in
             squared normalised units.
-        friction_margin: share of the mean friction that is planned with. Contacts are planned and
-            certified with `planned_friction`, which is mean friction times `friction_margin`.
+        friction_margin: share of the mean friction that is planned with. Contacts are planned, and
+            checked for force closure, with `planned_friction`. This is mean friction times
+            `friction_margin`.
         separation: least distance [m] between the centres of two fingertips. None means
             26 mm (`SEPARATION`), or more for wide fingertips (`least_separation`). Contacts on
             opposite sides of a thin object may be closer.
@@ -67,7 +68,7 @@ class ContactSpec(Value):
             points. None means the radius of the hand's fingertips, but at least 12 mm
             (`TIP_RADIUS`).
         start_radius: radius, normalised, of the sphere on which initial guesses are drawn. Its
-            centre is that of the shape's frame (Sec. 6.2).
+            centre is that of the shape's frame (Sec. 6.2 of the paper).
         fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
         contact_allowed: whether links may touch and push the target's neighbours. Such collisions
             then lower the predicted success, but do not make a grasp fail.
@@ -126,7 +127,7 @@ class ContactSpec(Value):
     def planned_friction(self) -> float:
         """The mean friction times `friction_margin`, a coefficient without unit.
 
-        Contacts are planned and certified with it.
+        Contacts are planned, and checked for force closure (`certify`), with it.
         """
         return self.mean_friction * self.friction_margin
 
@@ -300,8 +301,8 @@ class TrialSpec(Value):
     """Parameters of a simulated trial: close the hand on the true object, lift it off the table,
     hold it.
 
-    `close_hand` runs such a trial. The controller does not know `mass`, `density`, `friction`,
-    `gravity`, `patch` and the numbers of the simulator.
+    `close_hand` runs such a trial, and says when the object counts as held. The controller does not
+    know `mass`, `density`, `friction`, `gravity`, `patch` and the numbers of the simulator.
 
     Args:
         closing: how the hand closes.
@@ -312,7 +313,8 @@ class TrialSpec(Value):
               analytic if the hand's folder has no stability.safetensors.
             "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
             "position": PI control to goals behind the contacts.
-            "open_loop": joint motion from pre-grasp to grasp to squeeze.
+            "open_loop": joint motion from pre-grasp to grasp to squeeze, the targets with which the
+              fingers press.
         holding: how the closed hand presses; after "open_loop" the squeeze is kept.
             "grip": as strong as the measured load plus a push of 2.5 N requires.
             "force": balanced forces, of which `force` sets the strength.

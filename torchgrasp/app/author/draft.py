@@ -141,7 +141,8 @@ NO_WISH = Wish()
 def draft_hand(
     path: Path | str, tips: Sequence[str] = (), name: str | None = None, seed: Seed = 0
 ) -> str:
-    """Return the text of a hand.toml for a clean URDF, for the user to review.
+    """Return the text of a hand.toml, the file that describes a hand, for a clean URDF; the user
+    reviews it.
 
     `torchgrasp.testing.check_hand` checks the finished hand. The hand.toml has up to three sets of
     fingers that grasp: "default" with three tips, "four" and "five".
@@ -149,7 +150,8 @@ def draft_hand(
     Args:
         path: the URDF. It must need no repair; `new_hand` repairs others.
         tips: names of three to five fingertip links; each set has the first ones. Empty means the
-            last link of each branch; each set then has the tips whose pads face each other best.
+            last link of each branch; each set then has the tips whose pads face each other best. A
+            pad is the part of a tip that touches objects.
         name: name of the hand; None means the robot's name in the URDF.
         seed: seed of the random postures from which the fingertip pads are guessed.
 
@@ -177,7 +179,8 @@ def new_hand(
     seed: Seed = 0,
     file: str = "hand.urdf",
 ) -> Draft:
-    """Return a hand.toml for a published URDF or MJCF, with a repaired copy of the URDF.
+    """Return a hand.toml, the file that describes a hand, and a repaired URDF, for a published URDF
+    or MJCF.
 
     Sometimes hardly any random posture is free of self-collision. Then the pairs of links that meet
     most often are no longer tested. A warning names them.
@@ -185,7 +188,8 @@ def new_hand(
     Args:
         path: the URDF; or an MJCF (.xml, .mjcf), which MuJoCo reads and which becomes a URDF.
         wish: the user's choices, such as the fingertips.
-        seed: seed of the random postures by which pads are guessed and pairs of links are chosen.
+        seed: seed of the random postures. By them the pads, the parts of the fingertips that touch
+            objects, are guessed. They also tell which pairs of links are tested for collision.
         file: name of the file in which the user saves the repaired URDF; the hand.toml names it.
 
     Raises:

@@ -52,8 +52,8 @@ def write_glb(
         path: the file to write.
         hand: the hand of the grasp.
         grasp: a single grasp.
-        body: the object's mesh [m] in the frame of the grasp, or its estimated surface. The surface
-            is coloured by its standard deviation.
+        body: the object's mesh [m] in the frame of the grasp, that of the planned cloud. Or its
+            estimated surface. The surface is coloured by its standard deviation.
 
     Raises:
         BadArgument: there is not exactly one grasp, or its joints are of another hand.

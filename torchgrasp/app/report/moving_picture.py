@@ -70,7 +70,7 @@ def write_film(
         hand: the hand of the grasp.
         grasp: a single grasp.
         closure: the simulated closing of this grasp, from `close_hand`.
-        mesh: the object's mesh [m] in the frame of the grasp.
+        mesh: the object's mesh [m] in the frame of the grasp, that of the planned cloud.
         direction: direction (x, y, z) from the object to the camera, of any length. Axis z is up,
             along the normal of the grasp's table. Axis x points from the object's vertical centre
             line to its farthest point, such as a handle. Without a table, the axes are those of the

@@ -35,14 +35,15 @@ class Run:
         hand: the hand of the grasps.
         spec: the constraints on contacts, such as the table and the friction.
         surface: the estimated surface of the object.
-        grasps: all grasps of the plan, failed ones included, best first.
+        grasps: all grasps of the plan, best first, with those that failed a check.
         stages: name, result in words and wall time [s] of each stage.
         plan: the contacts that were planned; None if they are unknown.
         mesh: the true object [m]; None if it is unknown.
         closure: result of `close_hand` for the first executable grasp on `mesh`; None without a
             closing.
         scene: the scene that the cloud was cut from; None without a scene.
-        explanation: why no grasp is executable, and what would help; None if it is not asked for.
+        explanation: why no grasp passed all checks, and what would help; None if it is not asked
+            for.
         costs: sentences on what lowers the predicted success of the best grasp most, such as those
             of `explain_success`.
         look: where a second view would help (`next_view`); None if no second view is needed.
@@ -80,8 +81,8 @@ class Run:
 
     @property
     def good(self) -> bool:
-        """Whether the simulated closing held the object; without a closing, whether any grasp is
-        executable.
+        """Whether the simulated closing held the object, as `close_hand` defines it. Without a
+        closing, it is whether any grasp passed all checks.
         """
         return bool(self.closure.held) if self.closure is not None else len(self.executable) > 0
 
