@@ -53,15 +53,16 @@ def plan_contacts(
     order of the guesses.
 
     A set has `spec.fingertips` contacts. `ContactPlan.status` of a failed set is the `Status` of
-    the first constraint that it violates. If the solver fails from a feasible initial guess, the
-    guess itself is the result. Without `time_budget` the result is deterministic. Guesses are drawn
-    in chunks of 500. So a plan from 500 or 1000 guesses equals the first part of a plan from more.
+    the first constraint that it violates. If the solver fails from an initial guess that satisfies
+    all constraints, the guess itself is the result. Without `time_budget` the result is
+    deterministic. Guesses are drawn in chunks of 500. So a plan from 500 or 1000 guesses equals the
+    first part of a plan from more.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods (`ShapeLike`).
         spec: the constraints on contacts; None means `ContactSpec()`.
-        starts: number of random initial guesses (Sec. 6.2), or b sets of initial contact points (b,
-            f, 3) [m].
+        starts: number of random initial guesses (Sec. 6.2 of the paper), or b sets of initial
+            contact points (b, f, 3) [m].
         seed: random seed of the guesses.
         time_budget: wall time [s] of the call. The result then holds the first guesses that could
             be planned in this time, but at least 25 (`LEAST_STARTS`). None means all.
@@ -69,7 +70,7 @@ def plan_contacts(
     Raises `BadArgument` for:
 
     * a number of `starts` that is not positive;
-    * guesses of a wrong shape, or outside the domain of `shape`;
+    * guesses of a wrong shape, or outside the domain of `shape`, the ball in which it is known;
     * a `spec.start_radius` beyond this domain.
 
     >>> from torchgrasp import fit_shape, load_object

@@ -36,10 +36,10 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
     """Write simulated closings as a LeRobot data set (v3.0), to train policies on; return the
     folder.
 
-    `LeRobotDataset(name, root=folder)` reads it. Each closing is an episode. Each control tick is a
-    frame of the episode, except the last one. Positions [m] and quaternions (x, y, z, w) are in the
-    coordinate frame of the grasp. The pose of the hand is that of its root link. There are no
-    images and no rewards.
+    `LeRobotDataset(name, root=folder)` reads it. Each closing is an episode. Each control tick, a
+    period of the controller, is a frame of the episode, except the last one. Positions [m] and
+    quaternions (x, y, z, w) are in the coordinate frame of the planned cloud. The pose of the hand
+    and its frame are those of its root link. There are no images and no rewards.
 
     | feature | contents |
     | --- | --- |

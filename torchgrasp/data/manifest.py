@@ -274,8 +274,8 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
         objects: the folder of objects, as `write_objects` makes it.
         name: name of the object.
         view: name of the view, from `list_views`. "whole" means all sides, with normals and no
-            `viewpoint`. Its file, OBJECT/full_normals.ply, is not among those that `write_objects`
-            writes.
+            `viewpoint`. The user adds its file, OBJECT/full_normals.ply; `write_objects` does not
+            write it.
         camera: whether the cloud has a `viewpoint`.
 
     Raises `DatasetError` if there is no manifest, or if it has no valid entry of the object or the

@@ -35,7 +35,7 @@ def write_parquet(data: GraspShards, folder: Path | str) -> Path:
     The package `datasets` reads it. `load_dataset(folder)` has a row for each grasp. A row holds
     the tensors of `data[i]` without the cloud, and the status of each simulated trial. It also
     names object, view, hand, friction and seed. `load_dataset(folder, "views")` has a row for each
-    job: its cloud, its status and its counts. The cards name the joints.
+    job, one view of one object: its cloud, its status and its counts. The cards name the joints.
 
     Args:
         data: the data set, as `read_shards` opens it.

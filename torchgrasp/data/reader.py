@@ -34,7 +34,8 @@ class ShardJob(NamedTuple):
         row: names, status and counts of the job.
         cloud: the cloud [m] of the view; None if no view was read.
         grasps: the grasps, in the frame of the cloud.
-        passed: whether each trial of each grasp passed, a mask (g, d).
+        passed: whether each trial of each grasp passed, by the protocol of the campaign, a mask (g,
+            d).
         outcome: the `Status` of each trial of each grasp, integers (g, d).
     """
 
@@ -60,8 +61,10 @@ class GraspShards:
     * `margin`, a number, and `witness` (6,) of the `Certificate`.
     * `clearance` [m], the least distance of links from surface, table and each other (`Grasps`).
     * `predicted`, the predicted success in [0, 1]; NaN where no trial supports it.
-    * `simulated`, the share in [0, 1] of the grasp's simulated trials that passed.
-    * `closed`, a boolean: whether the contacts have frictional form closure.
+    * `simulated`, the share in [0, 1] of the grasp's simulated trials that passed, by the protocol
+      of the campaign.
+    * `closed`, a boolean: whether the contacts have frictional form closure (`certify`), so that
+      they can resist any load.
     * `job`, an integer: the index in `jobs` of the grasp's view.
 
     An index out of range raises `IndexError`, and a damaged file `ModelFileError`.
@@ -70,7 +73,7 @@ class GraspShards:
         folder: folder of the data set.
         card: content of `card.json`: "licence", "asked" (the settings of the campaign), "counts",
             "jobs" and others.
-        jobs: the outcome of each view of each object, with or without grasps.
+        jobs: the outcome of each job, one view of one object, with or without grasps.
         size: number of jobs in a shard, a file of the data set.
         points: number of points of each item's cloud. None means all points, so that clouds may
             differ in size.
@@ -131,8 +134,7 @@ class GraspShards:
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
-        """Return the cloud, the grasps and the trials of a job, in the dtype in which they are
-        stored.
+        """Return cloud, grasps and trials of a job, one view of one object, in the stored dtype.
 
         Args:
             j: index of the job in `jobs`, from 0.

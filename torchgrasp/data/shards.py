@@ -39,7 +39,7 @@ class JobRow(NamedTuple):
         note: details of the status, or "".
         family: name of a family of similar objects, or "".
         group: group of objects, such as "solid", or "".
-        executable: number of executable grasps that were planned.
+        executable: number of planned grasps that are executable: they passed all checks.
         points: number of points of the cloud.
         grasps: number of the executable grasps that were tried in simulation and kept.
         passed: number of simulated trials that passed, over all these grasps.

@@ -70,8 +70,8 @@ class DragResult(Value):
             `DROPPED`: the object toppled, or hangs or fell over the edge.
             `SLIPPED`: the object is more than 20 mm (`DRAGS.slipped`) from its planned place.
             `START_OVERLAP` and `UNSTABLE`: as in `close_hand`.
-        motion: motion (4, 4) [m] of the object in the frame of the plan, a rigid transform. NaN if
-            the status is `UNSTABLE`.
+        motion: motion (4, 4) [m] of the object in the frame of the planned cloud, a rigid
+            transform. NaN if the status is `UNSTABLE`.
         missed: distance [m] of the object's centre of mass from its planned place. NaN if the
             status is `UNSTABLE`.
         forces: sum (t,) [N] of the true normal forces of the fingertips at each control tick.
@@ -95,7 +95,8 @@ def drag_object(
     parts: "Sequence[trimesh.Trimesh] | None" = None,
     table: Plane | None = None,
 ) -> DragResult:
-    """Drag the true object as planned, in simulation; return where it came to rest.
+    """Drag the true object as planned, in simulation; return where it came to rest, and whether
+    this is its planned place.
 
     Args:
         plan: the drag, from `plan_edge_grasps`.
@@ -160,7 +161,7 @@ class EdgeLift(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """Whether the last try held the object."""
+        """Whether the last try held the object, as `close_hand` defines it; False without a try."""
         return bool(self.tries) and self.tries[-1].result.held
 
 
@@ -177,12 +178,14 @@ def lift_from_edge(
     parts: "Sequence[trimesh.Trimesh] | None" = None,
     table: Plane | None = None,
 ) -> EdgeLift:
-    """Drag the true object to the edge, then lift it with the plan's grasps, the first one first.
+    """Drag the true object to the table's edge, then lift it with the plan's grasps, the first one
+    first.
 
     The grasps are where the plan expects the object, and the object is where the drag left it.
 
     Args:
-        plan: drag and grasps, from `plan_edge_grasps`, with at least one executable grasp.
+        plan: drag and grasps, from `plan_edge_grasps`. At least one grasp must be executable: it
+            passed all checks.
         hand: the hand of the plan.
         mesh: the true object [m], as for `drag_object`.
         spec: parameters of both trials; None means the default of `drag_object`.

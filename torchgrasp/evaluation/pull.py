@@ -31,7 +31,8 @@ class PullResult(Value):
     """The result of a pull trial: whether the object stayed in the hand; `pull_grasp` returns it.
 
     Attributes:
-        passed: whether the object stayed in the hand in all six pulls.
+        passed: whether the object stayed in the hand in all six pulls, within the motion that
+            `PullSpec` allows.
         status: how the last pull ended. If no pull was tried, it says how the closing failed.
         directions: number of pulls that were tried, up to 6; 0 if the closing failed.
         moved: largest motion [m] of the object's centre of mass in the world, over all tried pulls.

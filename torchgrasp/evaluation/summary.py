@@ -40,9 +40,11 @@ class ProtocolResult(Value):
     `evaluate` makes it.
 
     Attributes:
-        rank: rank of the grasp among the executable grasps of its view; 0 is the best.
-        draw: index of the random pose error of the trial, from 0.
-        passed: whether the trial passed under its protocol.
+        rank: rank of the grasp among the executable grasps of its view, those that passed all
+            checks; 0 is the best.
+        draw: index of the trial's random pose error (`PoseNoise`), from 0.
+        passed: whether the trial passed: the object withstood all pulls, or the lift fulfilled the
+            protocol's `criterion`.
         status: how the trial ended: `OK`, or why it failed.
         moved: motion [m] of the object's centre: in pulls in the world, in a lift relative to the
             hand.
@@ -152,10 +154,10 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
 
     * "gsr": grasp success rate, the share of trials that passed.
     * "top1": share of trials of best-ranked grasps that passed. A view without a trial counts as
-      failed, once for each drawn pose error.
+      failed, once for each random pose error (`PoseNoise.draws`).
     * "objects": share of objects with at least one trial that passed.
     * "refused": number of views without a trial.
-    * "executable": number of executable grasps.
+    * "executable": number of executable grasps, those that passed all checks of the planner.
     * "by_object", "by_group": dicts of the five figures above for each object and each group.
     * "tries": list of the numbers of trials that passed with the first grasp, with the second
       grasp, and so on.

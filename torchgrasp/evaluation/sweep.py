@@ -47,18 +47,19 @@ def evaluate(
     """Plan grasps on every view of a folder of objects, and try them in simulation. Yield a score
     for each view.
 
-    The planner sees only the clouds; only the simulator uses the true meshes. An object with bad
-    files or a bad entry gives a score with a `refusal`. Scores of objects with a bad entry come
-    first. Nothing is planned before the first score is asked for.
+    The planner sees only the clouds; only the simulator uses the true meshes. The `protocol` says
+    when a trial passes. An object with bad files or a bad entry gives a score with a `refusal`.
+    Scores of objects with a bad entry come first. Nothing is planned before the first score is
+    asked for.
 
     Args:
         objects: folder of objects with its manifest, as `write_objects` makes it.
         hand: the hand that grasps.
         protocol: a protocol, or its name in `PROTOCOLS`.
         spec: which views and grasps are tried; None means `EvaluationSpec()`.
-        folder: folder in which the executable grasps of each view are saved, as
-            OBJECT/VIEW.safetensors. None means a temporary folder. No other run may write to it at
-            the same time.
+        folder: folder in which the executable grasps of each view, those that passed all checks,
+            are saved as OBJECT/VIEW.safetensors. None means a temporary folder. No other run may
+            write to it at the same time.
         workers: number of worker processes. 0 means this process, without time limits. The scores
             do not depend on it, with two exceptions. CPU times vary, and a task that reaches a
             limit of CPU time ends with the status `TIMED_OUT`. The number of such tasks, which

@@ -69,7 +69,8 @@ TRIALS = TrialNumbers()
 class Truth:
     """The true world of a trial, which only the simulator knows; `GraspTrial(truth=)` takes it.
 
-    Everything is in the frame of the grasp, in metres. Meshes are checked when a trial runs.
+    Everything is in the frame of the grasp, that of the planned cloud, in metres. Meshes are
+    checked when a trial runs.
 
     Args:
         mesh: closed mesh of the object [m], or its file.
@@ -106,8 +107,8 @@ class GraspTrial:
         grasp: one grasp of the hand, or for `lift_grasps` several in the order of preference.
         truth: the true world, which only the simulator knows.
         seed: seed of the sensors' noise, and of friction and mass if they are distributions.
-        told: the table that the controller knows, in the frame of the grasp. None means the table
-            of the plan (`Grasps.table`).
+        told: the table that the controller knows, in the frame of the grasp, that of the planned
+            cloud. None means the table of the plan (`Grasps.table`).
         surface: estimated surface of the object (`surface_field`), in the frame of the grasp. The
             controller compares touches with it to estimate the object's pose. None means the
             tangent planes of the planned contacts.

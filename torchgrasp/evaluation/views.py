@@ -67,14 +67,15 @@ class EvaluationSpec(Value):
         grasps: largest number of grasps to try for each view.
         ranks: "best" tries the best-ranked grasps, "spread" tries grasps spread evenly over all
             ranks.
-        starts: number of initial guesses of the contact planner.
+        starts: number of random initial guesses of the contact planner.
         complete: whether to plan on clouds of all sides with normals, as if the shape were known.
             They are the views "whole" of `read_view`.
         only: names of the objects to evaluate; empty means all.
         planned: whether to read the grasps that an earlier call of `evaluate` saved in its
             `folder`, instead of planning. A view whose file is missing or of another cloud or hand
             is refused (`BAD_OBJECT`).
-        seed: seed of the planner, of the pose errors and of the trials.
+        seed: seed of the planner, of the random pose errors of the trials (`PoseNoise`), and of the
+            trials.
         views: largest number of views of each object, the first by name. None means all views.
         fingers: the fingers that grasp (`load_hand`); None means the hand's own. "auto" takes for
             each view the fingers most likely to succeed.

@@ -47,7 +47,8 @@ class ArmMotion(Value):
 def plan_motion(
     arm: Arm, hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None
 ) -> ArmMotion:
-    """Return the motions of arm and hand through executable grasps that were planned with the arm.
+    """Return the motions of arm and hand through executable grasps, which passed all checks and
+    were planned with the arm.
 
     The opened hand moves straight over the last 0.1 m to its pre-grasp, closes and presses. Then it
     is lifted by 0.1 m along the normal of the plan's table, or along z without a table. Approach

@@ -502,9 +502,10 @@ def grasps_from_joints(
 ) -> Grasps:
     """Return imported joints and poses as `Grasps`, for `certify`, `close_hand` and the exporters.
 
-    Since no object is known, each contact is the contact point of a fingertip's pad. Its normal is
-    opposite to the pad's normal. Certificates are for these contacts. A grasp without frictional
-    form closure gets `Status.NOT_CLOSED`. Replace contacts and certificate if you know the surface.
+    Since no object is known, each contact is the contact point of a fingertip's pad, the part that
+    touches objects. Its normal is opposite to the pad's normal. Certificates are for these
+    contacts. A grasp gets `Status.NOT_CLOSED` without frictional form closure: its contacts cannot
+    resist every load. Replace contacts and certificate if you know the surface.
 
     `clearance` is that between links alone, and the predicted success is unknown (NaN). `approach`
     is the hand's approach axis.

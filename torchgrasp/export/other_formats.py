@@ -103,9 +103,9 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
     """Return grasps as the JSON text of a GraspGen data set.
 
     `transforms` [m] are poses of the hand's root link in the object's frame. `object_in_gripper`
-    says which grasps are executable. The fields `success` (predicted probability, null if unknown),
-    `joints` [rad or m] and `joint_names` are additions of torchgrasp; `joint_names` is empty if
-    `meta` of the grasps has none.
+    says which grasps are executable: they passed all checks. The fields `success` (predicted
+    probability, null if unknown), `joints` [rad or m] and `joint_names` are additions of
+    torchgrasp; `joint_names` is empty if `meta` of the grasps has none.
 
     Args:
         grasps: grasps, executable or not.

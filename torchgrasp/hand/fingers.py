@@ -247,7 +247,8 @@ class Fingertips(Value):
         The poses are in the palm's frame.
 
         Args:
-            values: positions (j, n) [rad or m] of all j movable joints of the URDF.
+            values: positions (j, n) [rad or m] of all j movable joints of the URDF, in the order of
+                `Hand.tree.joint_names`.
 
         Raises `BadArgument` for a wrong number of joints.
         """

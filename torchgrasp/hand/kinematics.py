@@ -29,8 +29,8 @@ Frames = Float[Tensor, "3 4 l n"]  # poses (3 x 4) of l links in n postures
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicTree(Value):
-    """The forward kinematics of a URDF, as tables of l links and j movable joints. A `Hand` holds
-    it as `tree`.
+    """The forward kinematics of a URDF, as tensors for its l links and j movable joints. A `Hand`
+    holds it as `tree`.
 
     The root link of a hand is its palm. `Fingertips.chains` holds only the part of the tree that
     leads to the fingertips. In `tables`, `joint` and `parent`, links are sorted by level: the

@@ -180,7 +180,8 @@ class SelfCollision(Value):
     @checked(gradients=True)
     def count_near(self, frames: Frames, below: Bound) -> int:
         """Return the number of pairs of shapes whose bounding spheres are nearer than `below` [m],
-        summed over n postures.
+        summed over n postures. Only for these pairs does `separations` compare the shapes
+        themselves.
 
         Args:
             frames: poses (3, 4, l, n) [m] of the l links, from `Hand.tree.frames`.

@@ -67,8 +67,8 @@ class GraspProblem(Value):
 
     Args:
         hand: the hand.
-        contacts: the b contact sets [m], in the object's frame, with `std_m`. Where the surface is
-            less certain, the pre-grasp opens farther.
+        contacts: the b contact sets [m], in the object's frame, with the standard deviation `std_m`
+            of the surface. Where the surface is less certain, the pre-grasp opens farther.
         certificate: the certificate of force closure of each contact set, from `certify`.
         world: the surroundings of the hand, with one object for all contact sets, or one for each.
         center: the object's centre (3,) [m], or one for each contact set (b, 3). Grasps whose

@@ -60,8 +60,8 @@ SOLVING = SolveNumbers()
 class IKSolution(Batch):
     """The hand configurations that `solve_ik` found, one for each of b contact sets.
 
-    h counts actuated joints, and f fingertips. A contact set for which nothing could be tried has
-    NaN, and the `permutation` 0 to f - 1.
+    h counts actuated joints, and f fingertips. A contact set without an initial guess has NaN, and
+    the `permutation` 0 to f - 1.
 
     Attributes:
         joints: actuated joints (b, h) [rad or m].
@@ -69,12 +69,12 @@ class IKSolution(Batch):
         permutation: indices (b, f): in set k finger i touches contact `permutation[k, i]`.
         tip_error: distance (b, f) [m] of each fingertip from its contact.
         normal_angle: angle (b, f) [rad] between the contact's inward normal and the axis of the
-            finger's pad.
-        clearance: least clearance (b,) [m] of the links from object, table, hard obstacles and each
-            other; negative where they overlap.
+            finger's pad. The pad is the part that touches objects.
+        clearance: least clearance (b,) [m] of the links from object, table, each other, and
+            obstacles that they must not touch. It is negative where they overlap.
         attempts: number (b,) of initial guesses that were refined.
-        status: `Status` code (b,): `OK`, or the first check that fails, such as `TIP_ERROR`. If
-            nothing was tried, it is `DEGENERATE` for contacts on a line, else `OUT_OF_REACH`.
+        status: `Status` code (b,): `OK`, or the first check that fails, such as `TIP_ERROR`.
+            Without an initial guess it is `DEGENERATE` for contacts on a line, else `OUT_OF_REACH`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -107,7 +107,7 @@ def solve_ik(
 
     Any finger may touch any contact. `Status.OK` means that no link collides, and every tip is
     within 1 mm of its contact. Every contact's inward normal is then in the cone of the finger's
-    pad (`Fingertips.cone`).
+    pad (`Fingertips.cone`). The pad is the part that touches objects.
 
     Args:
         hand: the hand.
@@ -117,8 +117,9 @@ def solve_ik(
             guesses come from `library`.
         world: object, table and obstacles that the links must not touch; None means that only
             self-collision counts.
-        method: "levenberg_marquardt", or "cobyla", the paper's method (Sec. 6.3). "cobyla" brings
-            each tip's contact point to its contact and ignores the contact's normal.
+        method: "levenberg_marquardt", or "cobyla", the paper's method (Sec. 6.3 of the paper).
+            "cobyla" brings each tip's contact point to its contact and ignores the contact's
+            normal.
         library: random postures of the hand, which give initial guesses; None means that they are
             drawn when they are needed.
 

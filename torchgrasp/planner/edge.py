@@ -38,7 +38,8 @@ from torchgrasp.values.specs import GRAVITY, ContactSpec
 @checked
 @dataclasses.dataclass(frozen=True)
 class EdgePlan(Value):
-    """A drag to the table's edge, and the grasps there; `plan_edge_grasps` returns it.
+    """A drag of the object along its table to the edge, and the grasps there; `plan_edge_grasps`
+    returns it.
 
     Attributes:
         drag: the drag; None if there is none, for which `reason` tells why.
@@ -84,8 +85,8 @@ def plan_edge_grasps(
 ) -> EdgePlan:
     """Plan to drag the object to the edge of its table, and grasps there; return both.
 
-    The grasps resist 1.5 times the object's weight (`DRAG.carried`), as with the argument `resist`
-    of `plan_grasps`.
+    A drag presses on the object from above and moves it along the table. The grasps resist 1.5
+    times the object's weight (`DRAG.carried`), as with the argument `resist` of `plan_grasps`.
 
     Args:
         cloud: points that a camera saw [m], as for `plan_grasps`.

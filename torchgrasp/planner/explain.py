@@ -186,8 +186,8 @@ class Trial(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Explanation(Value):
-    """Why planning found no executable grasp: which stage lost the candidates, and which single
-    change would help.
+    """Why planning found no executable grasp, one that passes all checks: which stage lost the
+    candidates, and which single change would help.
 
     `explain_empty` returns it. `print(explanation)` shows one line for each planning stage, and the
     `advice`.
@@ -197,8 +197,9 @@ class Explanation(Value):
             one.
         funnel: how many candidates each planning stage lost, and why, without a change. Its field
             `stages` has an entry for "contacts", "postures" and "grasps", in this order. An entry
-            has the name `stage`, the word `things` for its candidates, and their numbers `given`
-            and `kept`. The dict `lost` has the number lost for each `Status`.
+            has the name `stage` and the word `things` for its candidates. `given` is how many
+            candidates came to the stage, and `kept` how many it kept. The dict `lost` has the
+            number lost for each `Status`.
         trials: the result of planning with each change, the most helpful first. Its `words`
             describe the change, and `choice` is whether the user can make it. `executable` is the
             number of executable grasps. `expected` is the mean predicted success, in [0, 1], of the
@@ -281,7 +282,8 @@ def explain_empty(
     """Return why `plan_grasps` found no executable grasp, and which single change would give
     grasps.
 
-    Each change is tried by planning with it. The changes are:
+    An executable grasp is one that passed all checks. Each change is tried by planning with it. The
+    changes are:
 
     * no `keep`, `avoid` or `resist`;
     * other fingers, or another shipped hand;

@@ -211,7 +211,7 @@ def stream_grasps(
     Each batch holds at least one grasp, its best first. Each grasp has force closure, has passed
     all checks, and is scored. A later batch may hold a better grasp. All batches together, ranked,
     are the executable grasps of `plan_grasps` with the same arguments. The work stops when the
-    caller stops iterating. In modes other than "joint", and with "auto" fingers, there is one
+    caller stops iterating. With a `mode` other than "joint", and with "auto" fingers, there is one
     batch.
 
     Args:

@@ -38,7 +38,7 @@ class ThingPlan(Value):
         label: label of the object in the scene.
         success: predicted probability that the best grasp holds. 0 means no grasps, NaN an unknown
             success.
-        grasps: executable grasps, best first; None if there are none.
+        grasps: executable grasps, which passed all checks, best first; None if there are none.
         reason: sentence that says why there are no grasps; "" if there are.
         shape: the estimated shape of the object; None without grasps.
         status: why the object's image or its estimated shape (`TOO_VAGUE`) rules out a grasp. `OK`
@@ -68,7 +68,7 @@ class ScenePlan(Value):
     Attributes:
         things: one plan for each object; objects without a grasp come last.
         clear: labels of objects to take away, in this order, so that the `target` of `plan_scene`
-            has a grasp. It is empty without a target, if the target has a grasp, or or if its
+            has a grasp. It is empty without a target, if the target has a grasp, or if its
             `ThingPlan.status` rules one out. It is also empty if taking away up to three objects
             does not suffice.
 
@@ -113,9 +113,10 @@ def plan_scene(
     first.
 
     Nothing is planned for an object whose image shows that it cannot be grasped
-    (`Status.FEW_PIXELS` to `TOO_WIDE`). The same holds for a shape that is `TOO_VAGUE`. Of the
-    other objects, near and tall ones with free space around them are planned first. Objects at the
-    image border, or too large for a prediction of success, are planned last.
+    (`Status.FEW_PIXELS` to `TOO_WIDE`). The same holds if its estimated shape may be off by more
+    than half the object (`TOO_VAGUE`). Of the other objects, near and tall ones with free space
+    around them are planned first. Objects at the image border, or too large for a prediction of
+    success, are planned last.
 
     With a `target`, only this object is planned. If it has no grasp, it is planned again without
     the nearest objects. `ScenePlan.clear` then lists the ones to take away.

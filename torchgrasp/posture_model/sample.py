@@ -149,7 +149,7 @@ class SampleSpec(Value):
         sampling: which postures are kept.
             "uniform": all without self-collision, as in the paper.
             "grasping": of these, only postures in which contacts at random places on the pads can
-              have force closure.
+              have force closure. A pad is the part of a fingertip that touches objects.
 
     Raises `BadArgument` for values out of range.
 
@@ -194,7 +194,8 @@ def sample_configurations(
         sampling: which postures are kept.
             "uniform": all without self-collision.
             "grasping": of these, only postures in which contacts at random places on the pads can
-              have force closure. It needs a hand with three fingers.
+              have force closure. A pad is the part of a fingertip that touches objects. It needs a
+              hand with three fingers.
         observer: function that is called after each chunk of up to 10,000 postures, with the number
             of postures in this chunk.
 

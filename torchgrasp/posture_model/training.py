@@ -155,7 +155,8 @@ def fit_mixture(
     choose their number, use the BIC's elbow, not its minimum.
 
     Args:
-        samples: n postures of one hand: joints [rad or m] and fingertip codes.
+        samples: n postures of one hand: joints [rad or m] and contact codes of the fingertips
+            (`encode`).
         components: number m of Gaussians.
         seed: seed of k-means, and of the random subsets.
         iterations: largest number of EM steps.
@@ -179,7 +180,8 @@ def fit_mixture(
         BadArgument: a joint that does not vary, a number out of range, or another fit's checkpoint.
         ModelFileError: a damaged checkpoint.
         OutputError: a checkpoint that cannot be written.
-        IndefiniteCovariance: a component collapses more than three times.
+        IndefiniteCovariance: a component collapses more than three times: its covariance becomes
+            singular, or it has too few samples.
 
     >>> import torch
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))

@@ -92,8 +92,8 @@ def fit_shape(
     outline and its estimated hidden side are observed with more noise. The shape is kept out of
     free space and of the table.
 
-    With "paper", as in Sec. 3.1, the cloud's centre is observed at distance -1, normalised. 20
-    random points on a sphere around it are observed at distance +1.
+    With "paper", as in Sec. 3.1 of the paper, the cloud's centre is observed at distance -1,
+    normalised. 20 random points on a sphere around it are observed at distance +1.
 
     Args:
         cloud: points [m] of one object from one view or several (`merge_clouds`), or another value

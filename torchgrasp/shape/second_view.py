@@ -121,13 +121,14 @@ def next_view(
     Args:
         shape: the shape, from `fit_shape`.
         grasps: grasps of this shape, in its frame. The deviation is then the mean over the contacts
-            of the first 20 executable ones (`VIEW.grasps`). It is weighted by their predicted
-            success. None, or no executable grasp, means the mean over the surface.
+            of the first 20 grasps that passed all checks (`VIEW.grasps`). It is weighted by their
+            predicted success. None, or no such grasp, means the mean over the surface.
         table: the table's plane, or its height [m] along z; cameras are above it. None means the
             table of the grasps, if they have one. Without a table, cameras may be below the object.
-        distance: distance [m] of the camera from the middle of the surface, at least 1.5 radii
-            (`VIEW.near`) of the shape's domain. None means the mean distance of earlier cameras, or
-            0.5 m (`VIEW.far`) if none is known. If that is less than 1.5 radii, it means 1.5 radii.
+        distance: distance [m] of the camera from the middle of the surface. It is at least 1.5
+            radii (`VIEW.near`) of the shape's domain, the ball in which the shape is known. None
+            means the mean distance of earlier cameras, or 0.5 m (`VIEW.far`) if none is known. If
+            that is less than 1.5 radii, it means 1.5 radii.
 
     Raises `BadArgument` for a `distance` below 1.5 radii, and for grasps whose contacts all lie
     outside the shape's domain.

@@ -78,7 +78,7 @@ class Surface(Value):
     """A triangle mesh of the estimated surface, from `extract_surface`.
 
     It has v vertices and f triangles, in the cloud's frame. It is open where the surface leaves the
-    shape's domain.
+    shape's domain, the ball in which the shape is known.
 
     Attributes:
         vertices: corners (v, 3) [m] of the triangles.
@@ -117,7 +117,8 @@ def extract_surface(
 
     Args:
         shape: the shape, from `fit_shape`.
-        resolution: number of cells along the domain's diameter, 8 to 256.
+        resolution: number of cells along the diameter of the shape's domain, 8 to 256. The domain
+            is the ball in which the shape is known.
 
     Raises `BadArgument` for another resolution, or if the mean signed distance is nowhere zero.
 

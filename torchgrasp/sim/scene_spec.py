@@ -62,7 +62,7 @@ class Neighbour:
     """Another body on the simulated table, beside the object to grasp; `close_hand` takes it.
 
     Args:
-        mesh: closed mesh [m], in the frame of the grasp.
+        mesh: closed mesh [m], in the frame of the grasp, that of the planned cloud.
         parts: convex parts of the mesh [m]; None means those that `convex_parts` computes.
         mass: mass [kg]. None means that `TrialSpec.mass` or `TrialSpec.density` gives it, as for
             the object.

@@ -51,8 +51,8 @@ def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedSce
 
 
 class SimulatedHand:
-    """A simulated hand of f fingers, as a controller sees it: `tick` takes targets and returns
-    measurements.
+    """A simulated hand of f fingers, as a controller sees it: `tick` takes targets, simulates a
+    control tick, and returns measurements.
 
     Args:
         scene: scene at its initial state, from `open_scene`.
@@ -62,7 +62,8 @@ class SimulatedHand:
         generator: source of the noise of the fingertips' sensors; None means no noise.
 
     Attributes:
-        truth: the true contacts (`TipContact`) of the last tick, in the hand's frame.
+        truth: the true contacts (`TipContact`) of the last tick, in the frame of the hand's root
+            link.
         force: true normal forces (f,) [N], averaged over the last tick.
         pushes: full forces (f, 3) [N] of the fingertips on the object, in the world's frame,
             averaged over the last tick.

@@ -61,7 +61,7 @@ class Cost(NamedTuple):
             "object": the size of the object.
             "task": mass, friction and force of the task.
         log_odds: by how much (no unit) the cause lowers the log-odds of success, compared to grasps
-            that held.
+            that held. The log-odds of a probability p are log(p / (1 - p)).
         sentence: explanation of the cause, with its numbers.
     """
 
@@ -77,10 +77,11 @@ def explain_success(
     """Return at most three causes that lower the predicted success of the first grasp most, the
     greatest first.
 
-    Each cause stands for several features of the success model. Its `log_odds` is by how much the
-    log-odds rise if these features take their median over grasps that held. If no forces of the
-    fingers carry the weight of a lifted object, the `log_odds` of "load" are greater (`UNCARRIED`).
-    Causes that do not lower the success are left out.
+    The log-odds of a probability p are log(p / (1 - p)). Each cause stands for several features,
+    the inputs of the success model. Its `log_odds` is by how much the log-odds rise if these
+    features take their median over grasps that held. If no forces of the fingers carry the weight
+    of a lifted object, the `log_odds` of "load" are greater (`UNCARRIED`). Causes that do not lower
+    the success are left out.
 
     If no trial has tested some of the task's frictions and masses, "task" is always among the
     causes. Its sentence then says for what share of them the success is unknown.

@@ -81,8 +81,9 @@ class Disturbance(Value):
         impulse: sum (3,) of the normal impulses [N s].
         force: largest normal force (3,) [N], averaged over a control tick.
         early: mask (3,) of the kinds whose first contact was before a fingertip touched the object.
-        neighbour_pose: rigid transforms (t, m, 4, 4) [m] in the frame of the grasp, for t ticks and
-            m neighbours. Each moves a neighbour from its start to its place at the tick.
+        neighbour_pose: rigid transforms (t, m, 4, 4) [m] of m neighbours at t control ticks, in the
+            frame of the planned cloud. Each moves a neighbour from its start to its place at the
+            tick.
     """
 
     first_touch: Annotated[Float[Tensor, "3"], ANY]
@@ -95,7 +96,8 @@ class Disturbance(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingTrace(Value):
-    """True contacts of f fingertips, and estimates of the controller, at t control ticks.
+    """True contacts of f fingertips, and estimates of the controller, at t control ticks, the
+    periods of the controller.
 
     It is the field `trace` of a `ClosureResult`. Points and vectors are in the frame of the hand's
     root link, which moves with the hand.
@@ -107,8 +109,8 @@ class ClosingTrace(Value):
         sliding: speed (t, f) [m/s] of each fingertip along the surface.
         blend: weight lambda (t, f) of Eq. (26), 0 for position and 1 for force control. NaN if the
             control law was not active.
-        friction: coefficient of friction (t,) that the holding mode "grip" estimates; NaN before
-            the hand holds.
+        friction: coefficient of friction (t,) that the holding mode "grip" (`TrialSpec.holding`)
+            estimates; NaN before the hand holds.
         load: load (t,) [N] on the grasp that the holding mode "grip" estimates; NaN before the hand
             holds.
     """
