@@ -248,7 +248,8 @@ def first_contact(
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
-    """The probability that each of b contact sets has force closure on the true surface.
+    """The probability that each of b contact sets has force closure on the true surface: it then
+    resists any load.
 
     `closure_probability` returns it.
 

@@ -96,7 +96,7 @@ class ShapeLike(Protocol):
         """Return the mean signed distance (q,) at q normalised points `x` (q, 3), and its gradient
         (q, 3).
 
-        The distance is normalised, and the gradient has no unit.
+        The distance is normalised: one unit is `scale` [m]. The gradient has no unit.
         """
         ...
 

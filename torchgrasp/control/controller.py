@@ -44,7 +44,7 @@ CLOSING_TIME = 4.0
 
 class GraspController:
     """Controller that closes a hand on an object and holds it. Each `step` maps an `Observation` to
-    `Targets`, on the CPU.
+    `Targets`, on the CPU. A tick is the time between two steps.
 
     A closing controller brings the fingers to the object, then a hold controller presses. After
     pressing for 0.5 s (`PRESSING_TIME`), `closed` becomes true. The hand may then be lifted, but
@@ -188,11 +188,11 @@ class GraspController:
 
     @property
     def blend(self) -> Float[Tensor, " f"]:
-        """The share of force control (f,) of each finger at the last tick: 0 means position control
-        alone, 1 force control alone. It is lambda in Eq. (26) of the paper.
+        """The share of force control (f,) of each finger at the last `step`: 0 means position
+        control alone, 1 force control alone. It is lambda in Eq. (26) of the paper.
 
         It is NaN while the control law of Eq. (25) does not command the fingers. This is always so
-        in closing modes without this law. In modes with it, this is so before the first tick, in
+        in closing modes without this law. In modes with it, this is so before the first step, in
         the hold, and while the hand opens again.
         """
         acts = self.hold is None and self.reopening is None and self.time > 0.0

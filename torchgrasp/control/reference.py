@@ -61,10 +61,13 @@ class ClosingReference(Value):
             Touches are compared with it to locate the object. None means that the tangent planes of
             the contacts are used.
         sensor: sensors of the fingertips.
-        max_force: largest normal force [N] of a fingertip; None means no limit.
+        max_force: largest normal force [N] of a fingertip, 0.1 to 1000; None means no limit.
         distance_variance: variance (f,) [m^2] of the signed distance at each contact (f_cov in Eq.
             12 of the paper). The closing mode "paper" needs it. None if it is unknown.
-        friction: coefficient of friction that the grasp was planned for, or its `Distribution`.
+        friction: coefficient of friction that the grasp was planned for, 0 to 10, or its
+            `Distribution`.
+
+    Raises `BadArgument` for a number outside its range, or a pose that is not rigid.
     """
 
     hand: Hand
@@ -253,7 +256,7 @@ class ClosingReference(Value):
 
         They are `tips` - r n, with the radius r of each fingertip and its outward normal n. This is
         the normal of its planned contact (`normals`). `tips` (f, 3) [m] are the centres of the
-        fingertips, in the frame of the planned hand.
+        fingertips. Tips and result are in the frame of the hand's root link at the planned pose.
         """
         return tips - self.hand.tips.radius[:, None] * self.normals
 

@@ -112,8 +112,9 @@ class GraspTry:
     Args:
         grasps: the grasps in the order of preference.
         start: function that returns the `GraspController` of a single grasp.
-        surface: estimated surface of the object (`surface_field`) in the frame of the grasps, by
-            which the next grasp is chosen. None if it is unknown.
+        surface: estimated surface of the object (`surface_field`), by which the next grasp is
+            chosen. It is in the frame of the grasps, that of the planned cloud. None if it is
+            unknown.
         tried: indices of the grasps that were tried. The last one is the grasp of this try.
         moved: motion (4, 4) [m] of the object since the grasps were planned; None means no motion.
 
@@ -149,7 +150,7 @@ class GraspTry:
 
     @property
     def obj_from_hand(self) -> Float[Tensor, "4 4"]:
-        """The pose (4, 4) [m] at which the hand closes, in the frame of the grasps.
+        """The pose (4, 4) [m] of the closing hand's root link, in the frame of the planned cloud.
 
         It is the planned pose of the hand, moved with the object (`moved`).
         """

@@ -51,7 +51,7 @@ def feel_flags(tactile: TactileState, touching: Bool[Tensor, "f"]) -> TactileSta
     Contact points and normals are NaN.
 
     Args:
-        tactile: the state at the last tick; `no_contact` returns the first one.
+        tactile: the state at the last control tick; `no_contact` returns the first one.
         touching: mask (f,) of the fingertips that touch.
 
     >>> feel_flags(no_contact(), torch.tensor([True, False, False])).reading

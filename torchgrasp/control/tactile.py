@@ -82,7 +82,8 @@ class TactileState(Value):
     filters.
 
     `no_contact` returns the first one. `measure`, `feel_flags` or `feel_torques` then return one at
-    each tick. All tensors may have further leading axes `*b`, the same for all.
+    each tick, a period of the controller. All tensors may have further leading axes `*b`, the same
+    for all.
 
     Args:
         reading: normal force (*b, f) [N].
@@ -115,7 +116,7 @@ def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -
     state of a closing.
 
     Forces are 0, contact points and normals NaN, in float64 on the CPU. The fingertips are sampled
-    at the next tick.
+    at the next control tick.
 
     Args:
         batch: sizes of further leading axes of all tensors; by default none.
@@ -238,15 +239,15 @@ def smooth(old: Filtered, new: Filtered, cutoff: float, period: float) -> Filter
 
 
 class Targets(NamedTuple):
-    """Commands to hand and arm until the next tick.
+    """Commands to hand and arm until the next control tick.
 
     `GraspController.step` returns them.
 
     Attributes:
         joints: targets (j,) [rad or m] of all joints of the URDF, in the order of
             `hand.tree.joint_names`.
-        palm: displacement (3,) [m] of the palm from its planned path, in the frame of the planned
-            hand. The palm does not rotate.
+        palm: displacement (3,) [m] of the palm from its planned path. It is in the frame of the
+            hand's root link at the planned pose. The palm does not rotate.
         left: remaining length [m] of the approach; 0 if the hand is at its pre-grasp.
     """
 
@@ -258,7 +259,7 @@ class Targets(NamedTuple):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Observation(Value):
-    """What a hand measures at a tick, in the hand's frame (its root link).
+    """What a hand measures at a control tick, in the hand's frame (its root link).
 
     `observe` makes it. f counts fingertips, and j all joints of the URDF. Joints that slide have
     [m] in place of [rad].

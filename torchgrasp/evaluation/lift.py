@@ -97,8 +97,8 @@ def close_hand(
         spec: parameters of the trial; None means `TrialSpec()`.
         seed: seed of the sensors' noise, and of friction and mass if the `spec` has distributions
             of them.
-        error: pose (4, 4) [m] of the true hand in the frame of the planned hand; None means no
-            error. The controller does not know it.
+        error: pose (4, 4) [m] of the true hand in the frame of the planned hand, the hand at
+            `Grasps.obj_from_hand`. None means no error. The controller does not know it.
         parts: convex parts [m] of the mesh. None means the parts of a `GraspObject`, or those that
             `convex_parts` computes.
         table: the true table below the object, in the frame of the grasp. None means a level table

@@ -33,13 +33,17 @@ LEAST_MASS = 1e-3  # least mass [kg] of a task, so that no load is zero
 class PoseNoise(Value):
     """The bounds of random pose errors in the trials of a `Protocol`, drawn uniformly.
 
-    In pulls, the true pose of the hand differs from the planned one, in the frame of the planned
-    hand. In lifts, the object is displaced along the table and turned about the vertical.
+    In pulls, the true pose of the hand differs from the planned one. The error is in the frame of
+    the hand's root link at the planned pose. In lifts, the object is moved along the table and
+    turned about the vertical.
 
     Args:
-        translation: greatest error [m] along each axis.
-        rotation: greatest error [rad] about each axis; in lifts about the vertical only.
-        draws: number of trials that `evaluate` runs for each grasp, each with its own error.
+        translation: greatest error [m] along each axis, 0 to 10.
+        rotation: greatest error [rad] about each axis, 0 to pi; in lifts about the vertical only.
+        draws: number of trials that `evaluate` runs for each grasp, each with its own error, at
+            least 1.
+
+    Raises `BadArgument` for a number outside its range.
     """
 
     translation: Length = 0.0

@@ -39,7 +39,7 @@ class LiftTry(NamedTuple):
     """One try of `lift_grasps`: a grasp and the record of its lift.
 
     Attributes:
-        row: index of the grasp in `trial.grasp`.
+        row: index of the grasp in `trial.grasp`, the grasps in the order of preference.
         result: record of the lift, as `close_hand` returns it.
     """
 
@@ -63,7 +63,7 @@ def lift_grasps(
 
     Args:
         trial: the hand, grasps in the order of preference, and the true object. `trial.truth.error`
-            is the pose error of the first grasp.
+            is the error of the hand's pose at the first grasp.
         spec: parameters of the trial; None means `TrialSpec()`.
         tries: largest number of tries. With 1 the trial is that of `close_hand`.
 

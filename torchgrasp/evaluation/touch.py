@@ -107,15 +107,16 @@ def measure_touch(
 ) -> Touch:
     """Return the gaps between fingertips and an object at the planned posture of each grasp.
 
-    A gap is the signed distance from the object's surface to the sphere of a fingertip's pad. A pad
-    that is no sphere has only its contact point. No forces and no pose errors are taken into
-    account. The space behind the points of a cloud with a viewpoint counts as unseen.
+    A gap is the signed distance from the object's surface to the sphere of a fingertip's pad. The
+    pad is the part that touches objects. A pad that is no sphere has only its contact point. No
+    forces are taken into account, and no errors of the hand's pose. The space behind the points of
+    a cloud with a viewpoint counts as unseen.
 
     Args:
         hand: the hand of the grasps.
         grasps: g grasps; only `joints` and `obj_from_hand` are used.
-        surface: the object's mesh [m] with faces turned outward, or its cloud [m], in the frame of
-            the grasps.
+        surface: the object's mesh [m] with faces turned outward, or its cloud [m]. Both are in the
+            frame of the grasps, that of the planned cloud.
         limit: largest size [m] of a gap of either sign at which a fingertip counts as touching.
 
     Raises `BadArgument` for joints of another hand or beyond their limits, and for a cloud whose

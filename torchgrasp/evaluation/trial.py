@@ -70,7 +70,7 @@ class Truth:
     """The true world of a trial, which only the simulator knows; `GraspTrial(truth=)` takes it.
 
     Everything is in the frame of the grasp, that of the planned cloud, in metres. Meshes are
-    checked when a trial runs.
+    checked when a trial runs. The planned hand is the hand at the pose of the plan.
 
     Args:
         mesh: closed mesh of the object [m], or its file.
@@ -84,6 +84,8 @@ class Truth:
             None means no displacement. Without an approach there is no displacement either.
         camera: pose (4, 4) [m] of a depth camera (x right, y down, z forward). With it the robot
             looks again before the approach. None means no second look.
+
+    Raises `BadArgument` for an `error` or `camera` that is not a rigid transform.
     """
 
     mesh: "trimesh.Trimesh | Path | str"
@@ -106,12 +108,15 @@ class GraspTrial:
         hand: the hand.
         grasp: one grasp of the hand, or for `lift_grasps` several in the order of preference.
         truth: the true world, which only the simulator knows.
-        seed: seed of the sensors' noise, and of friction and mass if they are distributions.
+        seed: seed of the sensors' noise, and of friction and mass if they are distributions; 0 or
+            more.
         told: the table that the controller knows, in the frame of the grasp, that of the planned
             cloud. None means the table of the plan (`Grasps.table`).
         surface: estimated surface of the object (`surface_field`), in the frame of the grasp. The
             controller compares touches with it to estimate the object's pose. None means the
             tangent planes of the planned contacts.
+
+    Raises `BadArgument` for a `seed` out of range.
     """
 
     hand: Hand

@@ -107,8 +107,8 @@ def save_play(
         folder: the folder to write.
         player: the simulator: "mujoco", "maniskill", "newton" or "isaaclab". "usd" means a USD
             scene, whose script writes the grasp's motion as a USD file and does not play it.
-        mesh: closed mesh of the object [m] in the frame of the grasps. It may be the estimated
-            `Surface`, whose points below the table are moved up to it.
+        mesh: closed mesh of the object [m] in the frame of the grasps, that of the planned cloud.
+            It may be the estimated `Surface`, whose points below the table are moved up to it.
         spec: mass, friction, force, stiffness, heights, times and timestep; None means
             `TrialSpec()`.
         parts: convex parts [m] of the mesh; None means that `convex_parts` computes them.

@@ -50,9 +50,9 @@ class FingerAbility:
         sure_force: normal force [N] that the tip reaches in 90 % of the free postures. NaN if no
             joint moves the contact point along its normal in these postures.
 
-    Both forces act at the contact point of the pad, along the pad's normal. No other finger
-    presses, and each actuated joint exerts at most its effort. A posture is free if no links of the
-    hand overlap.
+    Both forces act at the contact point of the pad, the part that touches objects, along the pad's
+    normal. No other finger presses, and each actuated joint exerts at most its effort. A posture is
+    free if no links of the hand overlap.
     """
 
     name: str

@@ -315,7 +315,7 @@ class Hand(Value):
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.
             at: points (*b, f, 3) [m] in the palm's frame, each fixed to its fingertip. None means
-                the contact points of the pads.
+                the contact points of the pads, the parts of the fingertips that touch objects.
         """
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))

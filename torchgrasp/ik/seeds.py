@@ -92,8 +92,9 @@ class PostureLibrary(Value):
         vf_from_hand: pose (s, 4, 4) [m] of the hand's root link in the frame vf.
         centres: centres (s, f, 3) [m] of the fingertips, in the frame vf.
         feature: numbers (s, 6 f) without unit by which postures are compared. Each fingertip has
-            six: its centre divided by 10 mm (`SEEDS.length_scale`), then its pad's axis divided by
-            0.5 (`SEEDS.cosine_scale`). Both are in the frame vf.
+            six: its centre divided by 10 mm (`SEEDS.length_scale`), then the axis of its pad
+            divided by 0.5 (`SEEDS.cosine_scale`). The pad is the part that touches objects. Both
+            are in the frame vf.
         spheres: centres (s, k, 3) [m] of the collision spheres, in the frame of the hand's root
             link.
 

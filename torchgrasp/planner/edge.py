@@ -62,7 +62,8 @@ class EdgePlan(Value):
         """The predicted success of the first grasp, in [0, 1], times the success rate of drags.
 
         The rate is the share of simulated drags that ended as planned (`DRAG.ended`). The result is
-        0 without an executable grasp, and NaN if its success is unknown.
+        0 without an executable grasp, one that passed all checks, and NaN if its success is
+        unknown.
         """
         good = self.grasps[self.grasps.status == Status.OK]
         if not len(good):

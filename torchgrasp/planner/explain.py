@@ -223,8 +223,8 @@ class Explanation(Value):
     def best(self) -> Trial | None:
         """The most helpful change; None if no tried change gives a grasp.
 
-        Its `words` describe the change, and `executable` is the number of grasps with it.
-        `expected` is the mean predicted success, in [0, 1], of the best of them.
+        Its `words` describe the change, and `executable` is the number of grasps that passed all
+        checks with it. `expected` is the mean predicted success, in [0, 1], of the best of them.
         """
         return next((trial for trial in self.trials if trial.executable), None)
 

@@ -130,8 +130,8 @@ class HandSamples(Batch):
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def rows(self) -> Float[Tensor, "n d"]:
-        """Return the joints [rad or m] and the contact code of each posture, side by side, (n, h +
-        q).
+        """Return the samples that a mixture is fitted to: the joints [rad or m] and the contact
+        code of each posture, side by side, (n, h + q).
         """
         return torch.cat([self.joints, self.q], dim=-1)
 

@@ -102,8 +102,9 @@ class Observations(Batch):
         """Return (values, variances): all r observed numbers (r,), and the variances (r,) of their
         noise.
 
-        Here r is n plus three for each observed normal. The n distances (normalised) come first.
-        Then come the observed normals by component: all x, all y, all z.
+        Here r is n plus three for each observed normal. The n distances come first, normalised: one
+        unit is `Normalisation.scale` [m]. Then come the observed normals by component: all x, all
+        y, all z.
         """
         y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
@@ -111,8 +112,8 @@ class Observations(Batch):
 
     @property
     def least_noise(self) -> float:
-        """The least of all standard deviations: of distances (normalised), and of components of
-        observed normals (no unit).
+        """The least of all standard deviations: of distances (normalised: one unit is
+        `Normalisation.scale` [m]), and of components of observed normals (no unit).
         """
         every = torch.cat([self.distance_noise, self.normal_noise[self.has_normal]])
         return float(every.detach().min())
@@ -120,7 +121,8 @@ class Observations(Batch):
     def with_normals_first(self) -> "Observations":
         """Return the same observations in another order: those with normals come first.
 
-        Among points with normals, and among the others, the order is kept.
+        This is the order of the points in a `ShapeGP`. Among points with normals, and among the
+        others, the order is kept.
         """
         return self[torch.argsort(~self.has_normal, stable=True)]
 
@@ -187,8 +189,9 @@ class MeanJet(Batch):
         """The Jacobian (*b, 3, 3) of the unit normals with respect to the points [1 / normalised
         unit].
 
-        It is (1 - n n^T) H / |g|, with the normal n, the Hessian H and the gradient g. Entry (i, j)
-        is the derivative of normal_i with respect to point_j.
+        One normalised unit is `ShapeGP.scale` [m]. The Jacobian is (1 - n n^T) H / |g|, with the
+        normal n, the Hessian H and the gradient g. Entry (i, j) is the derivative of normal_i with
+        respect to point_j.
         """
         n = self.normals
         steep = norm(self.gradient)[..., None, None]

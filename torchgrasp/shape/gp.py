@@ -131,8 +131,9 @@ class ShapeGP(Posterior, Normalisation):
                 taken: `x`, `has_normal`, `weights`, `factor`, `order` and `kernel`.
             frame: the normalised frame of the posterior's points.
             cloud: the seen points [m], in the frame of `frame.center`.
-            psi: length of the posterior's kernel, normalised. It does not change the kernel.
-                Batches of shapes with thin plate kernels are evaluated with it.
+            psi: length of the posterior's kernel, normalised: one unit is `frame.scale` [m]. It
+                does not change the kernel. Batches of shapes with thin plate kernels are evaluated
+                with it.
             std_factor: ratio of the surface's true deviations to the posterior's standard
                 deviations.
 
@@ -390,7 +391,7 @@ class ShapeGP(Posterior, Normalisation):
     @checked
     def append(self, new: Observations) -> "ShapeGP":
         """Return the shape given further observations in its normalised frame, in addition to all
-        earlier ones.
+        earlier ones. One normalised unit is `scale` [m].
 
         Kernel, `cloud` and the domain do not change. The domain is the ball in which the posterior
         is valid. `update` does the same for points [m]. Raises `IndefiniteCovariance` for

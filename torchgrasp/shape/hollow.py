@@ -53,13 +53,15 @@ class HollowShape(ShapeGP):
 
     `fit_shape` returns it for an upright open vessel seen from above on a `table`. It has all
     methods of `ShapeGP`. Each surface is a Gaussian process of its own. The reason is that one
-    smooth field cannot change its sign twice within a thin wall. Both share one normalised frame.
+    smooth field cannot change its sign twice within a thin wall. Both share one normalised frame,
+    with one unit of `scale` [m].
 
     At each point one surface applies: the surface with the greater mean signed distance. Distance,
     normal and covariance are those of this surface. The errors of the two surfaces are independent.
 
     The attributes of `ShapeGP` describe the outer surface. But `cloud` holds the points of both
-    surfaces, and `domain_radius` is the smaller of their two radii.
+    surfaces. `domain_radius` is the smaller of the radii of their domains, the balls in which they
+    are valid.
 
     Attributes:
         inner: the inner surface; its signed distance is positive in the cavity and negative around
@@ -185,7 +187,8 @@ class HollowShape(ShapeGP):
 
         The points are those that `normalise` returned. The result is normalised: one unit is
         `scale` [m]. Points at which different surfaces apply have covariance 0. `joint` does the
-        same for points [m], but limits their number and refuses points outside the domain.
+        same for points [m]. But it limits their number, and refuses points outside the domain, the
+        ball in which the shape is valid.
         """
         outer = self.outer.joint_at(x)
         inner = self.inner.joint_at(x)

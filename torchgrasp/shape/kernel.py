@@ -113,7 +113,8 @@ class Kernel:
         count as 0, and k3 is not reliable.
 
         Args:
-            r: normalised distances (*s,) of any shape. Each result has the same shape.
+            r: normalised distances (*s,) of any shape; one unit is `ShapeGP.scale` [m]. Each result
+                has the same shape.
             count: number of results, 1 to 4.
 
         Raises `BadArgument` for a `count` out of range.

@@ -171,7 +171,7 @@ class SimulatedHand:
         self.steps += ticks * self.substeps
 
     def unbalanced(self) -> float:
-        """Return how far the fingertip forces of the last tick are from balance, in [0, 1].
+        """Return how far the fingertip forces of the last control tick are from balance, in [0, 1].
 
         It is the norm of the sum of all forces, divided by the sum of their norms; NaN without
         forces.

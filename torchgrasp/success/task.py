@@ -37,8 +37,9 @@ class GraspTask(Value):
             "uncertainty": by touch.
             "open_loop": without sensors, from pre-grasp to grasp to squeeze. The squeeze is joint
               targets with which the fingers press.
-        displaced: whether the object may have moved since the camera saw it: by up to 30 mm along
-            the table, or by up to 5 mm and 5 degrees in pulls.
+        displaced: whether the object may have moved since the camera saw it. In a lift it may have
+            moved by up to 30 mm along the table. In pulls it may have moved by up to 5 mm and 5
+            degrees.
 
     Raises `BadArgument` for a number outside its range, or a lift in open loop.
 
@@ -61,7 +62,8 @@ class GraspTask(Value):
         """Return the task as a short text, such as "lift of 0.5 kg".
 
         The text begins with "lift" or "pulls", or with "task" if the field `lift` is None. It names
-        `force` if that is not None, and ends with ", displaced" if `displaced` is True.
+        `force` if that is not None. It ends with ", displaced" if the object may have moved
+        (`displaced`).
         """
         what = "task" if self.lift is None else "lift" if self.lift else "pulls"
         force = "" if self.force is None else f" with {self.force:g} N"

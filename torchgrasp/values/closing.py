@@ -81,9 +81,9 @@ class Disturbance(Value):
         impulse: sum (3,) of the normal impulses [N s].
         force: largest normal force (3,) [N], averaged over a control tick.
         early: mask (3,) of the kinds whose first contact was before a fingertip touched the object.
-        neighbour_pose: rigid transforms (t, m, 4, 4) [m] of m neighbours at t control ticks, in the
-            frame of the planned cloud. Each moves a neighbour from its start to its place at the
-            tick.
+        neighbour_pose: rigid transforms (t, m, 4, 4) [m] of m neighbours at t control ticks. They
+            are in the frame of the planned cloud. Each moves a neighbour from its start to its
+            place at the tick.
     """
 
     first_touch: Annotated[Float[Tensor, "3"], ANY]

@@ -157,7 +157,7 @@ class Contacts(Batch):
         points: contact points (b, f, 3) [m] on the object.
         normals: outward unit normals (b, f, 3) of the object at these points.
         variance: variance (b, f) of the signed distance at each contact (Eq. 12), in squared
-            normalised units. None if it is unknown.
+            normalised units; one unit is `ShapeGP.scale` [m]. None if it is unknown.
         std_m: standard deviation (b, f) [m] of the surface at each contact; None if it is unknown.
 
     Raises `BadArgument` for tensors of different dtypes, or of shapes that do not fit together.
@@ -460,7 +460,7 @@ class Grasps(Batch):
 
     @property
     def table(self) -> Plane | None:
-        """The table that the planner was given, in the frame of the grasps.
+        """The table that the planner was given, in the frame of the planned cloud.
 
         None if the grasps were planned without a table, or if `meta` does not say.
         """

@@ -214,6 +214,8 @@ class ContactSpec(Value):
             below: radius [m] of the flat areas that were tried before.
             radius: radius [m] of the hand's fingertips; 0 keeps `tip_radius` as it is.
 
+        Raises `BadArgument` for a `below` or `radius` that is negative or above 10 m.
+
         >>> relaxed = ContactSpec(table=0.0).relaxed(0.003, 0.0096)
         >>> [round(spec.planned_friction, 1) for spec in relaxed]
         [0.4, 0.6, 0.8]
@@ -413,7 +415,7 @@ class TrialSpec(Value):
 
     @property
     def pressing(self) -> HoldingMode:
-        """The holding mode of the trial, such as "grip".
+        """The holding mode of the trial, such as "grip": how the closed hand presses.
 
         This is the field `holding`, if that is not None. Otherwise it is "grip", or "force" in
         three cases: `force` is given, `closing` is neither "uncertainty" nor "fixed", or a
@@ -434,7 +436,7 @@ class TrialSpec(Value):
 
     @property
     def components(self) -> ClosingOptions:
-        """The `ClosingOptions` with which the hand closes.
+        """The `ClosingOptions` with which the hand closes, such as the number of attempts.
 
         For the closing "uncertainty" or "fixed" they are the field `options`, or `ClosingOptions()`
         if that is None. Other closings have no options: for them all options are off.

@@ -120,7 +120,8 @@ class Wish(NamedTuple):
         tip_offset: lengths [m] by which tactile sensors extend the fingertips. () means no sensors.
             One number counts for all fingertips, several for each of `tips`; 0 adds no sensor. A
             sensor points away from the axis of the finger's last joint, to the fingertip's end. The
-            contact point of the fingertip's pad moves by this length; its normal stays.
+            pad, the part of the fingertip that touches objects, has a contact point. It moves by
+            this length; its normal stays.
         tip_radius: radii [m] of the balls in which the sensors end, counted like `tip_offset`. ()
             means the radii of the fingertips' own balls.
     """

@@ -44,7 +44,7 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
             it. "" means no link.
 
     Raises `OutputError` if the file cannot be written, and `BadArgument` if the executable grasps
-    do not touch the run's mesh.
+    do not touch the run's mesh. These are the grasps that passed all checks.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object

@@ -44,15 +44,15 @@ def write_recording(path: Path | str, run: Run) -> Path:
     * `cloud`, and `surface` coloured by its standard deviation.
     * `contacts` of the best grasp, as arrows along the outward normals.
     * `plan/hand`: the best grasp on the timeline `posture`: approach, pre-grasp, grasp and squeeze.
-      Squeeze is the target of the finger drives.
+      Squeeze is the targets of the finger drives, with which the fingers press.
     * `closing/hand` and `closing/object`: the simulated closing, on the timeline `time` [s].
     * `closing/forces`: the forces on the object as arrows, 1 cm for each newton.
 
     Three entities are outside it. `force/FINGER` is the curve of a fingertip's force [N]. The texts
     `postures` and `moments` name the postures, and the key moments of the closing.
 
-    A run without an executable grasp has no `contacts`, `plan` and `postures`. A run without a
-    closing or a mesh has no `closing`, `force` and `moments`.
+    An executable grasp is one that passed all checks. A run without one has no `contacts`, `plan`
+    and `postures`. A run without a closing or a mesh has no `closing`, `force` and `moments`.
 
     Args:
         path: the file to write, FILE.rrd.

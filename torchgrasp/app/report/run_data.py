@@ -92,7 +92,7 @@ class Run:
         z is the normal of the table in `spec`, and the table has the height z = 0. Without a table,
         z points to the camera. Without both, it points where the points spread least.
 
-        Raises `BadArgument` if the executable grasps do not touch the mesh. It is also raised if
+        Raises `BadArgument` if the `executable` grasps do not touch the mesh. It is also raised if
         the table is above most points of the cloud.
         """
         obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)

@@ -86,7 +86,7 @@ def write_viewer(path: Path | str, run: Run) -> Path:
     * the cloud, and the surface coloured by its standard deviation;
     * the surface moved by a chosen number of standard deviations;
     * the best 20 grasps with their contacts, each in four postures. They are approach, pre-grasp,
-      grasp and squeeze (the target of the finger drives);
+      grasp and squeeze, the targets with which the fingers press;
     * a replay of the run's closing with its forces.
 
     The address may name a state: `view.html#grasp=3&posture=squeeze&sigma=2` or
@@ -97,7 +97,7 @@ def write_viewer(path: Path | str, run: Run) -> Path:
         run: the inputs and results that the page shows.
 
     Raises `OutputError` if the file cannot be written, and `BadArgument` if the executable grasps
-    do not touch the run's mesh.
+    do not touch the run's mesh. These are the grasps that passed all checks.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
