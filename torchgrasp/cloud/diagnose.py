@@ -72,7 +72,8 @@ class CloudReport(Value):
         noise: median rms distance [m] of neighbouring points from the plane that is fitted to them.
         copies: number of points that coincide with an earlier point.
         outliers: estimated number of points far from their neighbours.
-        normals: agreement of the given normals among neighbours; None without normals.
+        normals: agreement of the given normals among neighbours (`NormalCheck`); None without
+            normals.
         viewpoint: position (3,) [m] of the camera. For a cloud of several cameras it is (v, 3), the
             camera of each of v measured points. None for a surface that is seen from all sides.
         viewpoint_given: True if the viewpoint was given; False if it is estimated.

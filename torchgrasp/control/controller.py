@@ -142,7 +142,8 @@ class GraspController:
 
     @property
     def closed(self) -> bool:
-        """Whether the hand has closed and pressed long enough, so that it may be lifted.
+        """Whether the hand has closed and pressed for 0.5 s (`PRESSING_TIME`), so that it may be
+        lifted.
 
         If another attempt is allowed (`ClosingOptions.attempts`), the grasp must also seem strong
         enough to lift the object. In the closing mode "open_loop" it is true at the end of the

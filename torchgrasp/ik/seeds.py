@@ -212,7 +212,7 @@ def nearest_postures(
     reachable: Reachable | None = None,
 ) -> IKSeeds:
     """Return initial guesses for inverse kinematics: postures of a library, placed on contact sets
-    (Eq. 24).
+    (Eq. 24 of the paper).
 
     The guesses are in the order of the contact sets. Each set has at most `n_seeds`, best first,
     and none if its contacts lie on a line. A guess is better if its fingertips are nearer to the

@@ -143,7 +143,7 @@ def plan_grasps(
         observer: function that is called after each stage, with its name, a text and its result.
 
     Returns:
-        Grasps: executable ones (`Status.OK`) first, best first; if none, see `explain_empty`.
+        Grasps: executable ones (all checks passed) first, best first; if none, see `explain_empty`.
 
     Raises:
         BadArgument: an argument of the wrong type or range; a bad file of cloud or hand.

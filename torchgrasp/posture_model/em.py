@@ -105,7 +105,8 @@ class DataRows:
 
 @dataclasses.dataclass(frozen=True)
 class Components(Value):
-    """The m Gaussians of a mixture in d dimensions: weights, means and covariances (Eqs. 19-20).
+    """The m Gaussians of a mixture in d dimensions: weights, means and covariances (Eqs. 19-20 of
+    the paper).
 
     `FitProgress` reports them during a fit. The dimensions are then standardised: each has mean 0
     and variance 1 over the samples.

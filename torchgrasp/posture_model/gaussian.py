@@ -50,7 +50,8 @@ class of_parameters(kept[Kept]):
 @checked
 @dataclasses.dataclass(frozen=True)
 class GaussianMixture(Value):
-    """A mixture of m Gaussians over d named dimensions (Eqs. 19-20), evaluated in float64.
+    """A mixture of m Gaussians over d named dimensions (Eqs. 19-20 of the paper), evaluated in
+    float64.
 
     Densities are differentiable, to any order, in the points and in `weights`, `means` and
     `covariances`.
@@ -108,7 +109,7 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
-        """Return the log-density (*b,) [nats] of the mixture at each point, Eq. (19).
+        """Return the log-density (*b,) [nats] of the mixture at each point, Eq. (19) of the paper.
 
         Args:
             x: points (*b, d), each coordinate in the unit of its dimension. b stands for any batch
@@ -167,7 +168,7 @@ class GaussianMixture(Value):
     @checked(gradients=True)
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
         """Return the marginal mixture over some of the dimensions, in the order of `names`, Eq.
-        (22).
+        (22) of the paper.
 
         Raises `BadArgument` for an unknown or repeated name.
         """
@@ -178,7 +179,8 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
-        """Return the mixture over the other dimensions, given the values of some of them, Eq. (23).
+        """Return the mixture over the other dimensions, given the values of some of them, Eq. (23)
+        of the paper.
 
         Components whose weight becomes 0 are left out, except inside `torch.vmap`.
 

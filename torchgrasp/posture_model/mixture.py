@@ -63,7 +63,7 @@ def encode_fingertips(
 @checked(gradients=True)
 def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     """Return the contact code of each of b contact triples, for all six assignments to fingers,
-    Eqs. (15)-(18).
+    Eqs. (15)-(18) of the paper.
 
     A code is six numbers that no rigid motion changes. They are the distances [m] of the three
     contacts from their centroid, and the cosines between their normals. The returned `ContactCode`
@@ -165,8 +165,8 @@ def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspMixture(GaussianMixture):
-    """The learned posture model of a hand: a mixture over its joints and contact codes (Eqs.
-    19-20).
+    """The learned posture model of a hand: a mixture over its joints and contact codes (Eqs. 19-20
+    of the paper).
 
     `load_mixture` reads it, and `fit_mixture` fits it. `energy` tells whether the hand reaches
     contacts of a given code. `joints` returns the joints that it then most likely has.
@@ -258,7 +258,7 @@ class GraspMixture(GaussianMixture):
         self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]
     ) -> Float[Tensor, "*b h"]:
         """Return the expected positions (*b, h) [rad or m] of the joints, given each contact code,
-        Eq. (23).
+        Eq. (23) of the paper.
 
         They may exceed the joint limits.
 
@@ -288,9 +288,9 @@ class GraspMixture(GaussianMixture):
         contact code.
 
         `joints` (*b, k, h) [rad or m] are each component's mean given the code. `responsibilities`
-        (*b, k) are the components' probabilities given the code, h_i in Eq. (23), the largest
-        first. Use `modes` where several postures have the same code. The mean that `joints` returns
-        may then be none of these postures.
+        (*b, k) are the components' probabilities given the code, h_i in Eq. (23) of the paper, the
+        largest first. Use `modes` where several postures have the same code. The mean that `joints`
+        returns may then be none of these postures.
 
         Args:
             q: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch axes. A

@@ -146,8 +146,8 @@ def fit_mixture(
     distributed: bool = False,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> GraspMixture:
-    """Return the mixture of Eqs. (19)-(20), fitted to sampled postures by expectation-maximisation
-    (EM).
+    """Return the mixture of Eqs. (19)-(20) of the paper, fitted to sampled postures by
+    expectation-maximisation (EM).
 
     The fit starts from k-means. The mixture's `meta` reports iterations, convergence, collapsed
     components, mean log-likelihood [nats] and the Bayesian information criterion (BIC). Contact

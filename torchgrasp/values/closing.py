@@ -107,8 +107,8 @@ class ClosingTrace(Value):
         points: contact points (t, f, 3) [m]; NaN without contact.
         normals: outward unit normals (t, f, 3) of the object; NaN without contact.
         sliding: speed (t, f) [m/s] of each fingertip along the surface.
-        blend: weight lambda (t, f) of Eq. (26), 0 for position and 1 for force control. NaN if the
-            control law was not active.
+        blend: weight lambda (t, f) of Eq. (26) of the paper, 0 for position and 1 for force
+            control. NaN if the control law was not active.
         friction: coefficient of friction (t,) that the holding mode "grip" (`TrialSpec.holding`)
             estimates; NaN before the hand holds.
         load: load (t,) [N] on the grasp that the holding mode "grip" estimates; NaN before the hand

@@ -156,8 +156,8 @@ class Contacts(Batch):
     Args:
         points: contact points (b, f, 3) [m] on the object.
         normals: outward unit normals (b, f, 3) of the object at these points.
-        variance: variance (b, f) of the signed distance at each contact (Eq. 12), in squared
-            normalised units; one unit is `ShapeGP.scale` [m]. None if it is unknown.
+        variance: variance (b, f) of the signed distance at each contact (Eq. 12 of the paper), in
+            squared normalised units; one unit is `ShapeGP.scale` [m]. None if it is unknown.
         std_m: standard deviation (b, f) [m] of the surface at each contact; None if it is unknown.
 
     Raises `BadArgument` for tensors of different dtypes, or of shapes that do not fit together.
@@ -229,7 +229,8 @@ class ContactPlan(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Certificate(Batch):
-    """Whether each of b contact sets has frictional form closure (Eq. 13), with a proof.
+    """Whether each of b contact sets has frictional form closure (Eq. 13 of the paper), with a
+    proof.
 
     `certify` returns it, and `closed` is the answer. Frictional form closure is also called force
     closure. The contacts then resist any load if the fingers press hard enough. f counts the
@@ -280,7 +281,8 @@ class Certificate(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactCode(Value):
-    """The code q of sets of three contacts (Eq. 18), which does not change with the frame.
+    """The code q of sets of three contacts (Eq. 18 of the paper), which does not change with the
+    frame.
 
     `encode` returns it. b counts contact sets. The axis of length 6 counts the assignments of the
     three contacts to three fingers.
