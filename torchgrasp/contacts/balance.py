@@ -171,8 +171,8 @@ def least_friction_forces(
 
     Their sum and the sum of their torques are zero. The friction that they need is the greatest
     ratio of tangential to normal force at a contact. It is a little more than the least possible
-    one, because even forces are also favoured. For four or five contacts it may be greater by 0.04
-    (`BALANCE.slack`). All forces of a set are NaN if no balanced forces push at each of its
+    one, because equal normal forces are also favoured. For four or five contacts it may be greater
+    by 0.04 (`BALANCE.slack`). All forces of a set are NaN if no balanced forces push at each of its
     contacts.
 
     Args:

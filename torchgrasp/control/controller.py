@@ -137,7 +137,9 @@ class GraspController:
 
     @property
     def approaching(self) -> bool:
-        """Whether the opened hand is still on its way to the pre-grasp."""
+        """Whether the opened hand is still on its way to the pre-grasp, the pose from which the
+        fingers close.
+        """
         return self.guard is not None
 
     @property

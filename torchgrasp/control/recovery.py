@@ -396,8 +396,8 @@ class LiftCheck:
 
     `lost` becomes true, and stays so, at the first of two events (bounds: `LOST`):
 
-    * The hand has risen by at least 10 mm, and fewer than two fingertips touch. All fingertips
-      together carry a low-passed load of less than 0.2 N along the table's normal.
+    * The hand has risen by at least 10 mm, and fewer than two fingertips touch. In addition, all
+      fingertips together carry a low-passed load of less than 0.2 N along the table's normal.
     * Two fingertips have each slid by more than 1.5 mm in total, before the hand was 20 mm high.
 
     Without a table, or with binary sensors, the load is unknown and counts as 0. Fingertips with

@@ -123,7 +123,8 @@ class Protocol(Value):
 
     @property
     def task(self) -> GraspTask:
-        """The task of the protocol's trials, for `plan_grasps`, which predicts the success in it.
+        """The task of the protocol's trials, a lift or pulls, for `plan_grasps`, which predicts the
+        success in it.
 
         >>> find_protocol("dexgraspbench").task.describe()
         'pulls of 0.1 kg with 7 N'

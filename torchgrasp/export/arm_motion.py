@@ -58,7 +58,8 @@ def plan_motion(
         arm: the arm, with the `obj_from_base` for which the grasps were planned.
         hand: the hand on the arm.
         grasps: executable grasps of `plan_grasps(..., arm=arm)`.
-        force: normal force [N] of the strongest finger at the "squeeze".
+        force: normal force [N] of the strongest finger at the "squeeze", the targets with which the
+            fingers press.
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
 
     Raises `BadArgument` for grasps that were planned without this arm or with it at another place.

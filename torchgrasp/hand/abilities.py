@@ -118,12 +118,16 @@ class HandAbilities:
 
     @property
     def least_width(self) -> float:
-        """The least thickness [m] of a plate that two tips hold; NaN if no tips hold one."""
+        """The least thickness [m] of a plate that two tips hold between them (`PairAbility`); NaN
+        if no tips hold one.
+        """
         return min(_known(pair.least_width for pair in self.pairs), default=math.nan)
 
     @property
     def greatest_width(self) -> float:
-        """The greatest thickness [m] of a plate that two tips hold; NaN if no tips hold one."""
+        """The greatest thickness [m] of a plate that two tips hold between them (`PairAbility`);
+        NaN if no tips hold one.
+        """
         return max(_known(pair.greatest_width for pair in self.pairs), default=math.nan)
 
     @checked

@@ -39,7 +39,7 @@ class ActuatedJoints(Value):
     """The h actuated joints of the grasping fingers; a `Hand` holds them as `actuated`.
 
     The actuated joints determine all j movable joints of the URDF. Their positions are `coupling @
-    joints + offset`.
+    joints + offset`, in the order of `Hand.tree.joint_names`.
 
     Attributes:
         names: names of the h actuated joints, in the order of every tensor of joints.
@@ -65,7 +65,8 @@ class ActuatedJoints(Value):
     def expand(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
         """Return the positions (*b, j) [rad or m] of all j movable joints of the URDF.
 
-        b stands for any batch axes. Limits are not checked.
+        They are in the order of `Hand.tree.joint_names`. b stands for any batch axes. Limits are
+        not checked.
 
         Args:
             joints: positions (*b, h) [rad or m] of the h actuated joints.
@@ -79,8 +80,8 @@ class ActuatedJoints(Value):
     def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
         """Return the positions (*b, j) [rad or m] of all j movable joints of the URDF.
 
-        Unlike `expand`, it does not check for NaN and infinity. On a GPU this check would have to
-        wait for the values.
+        They are in the order of `Hand.tree.joint_names`. Unlike `expand`, it does not check for NaN
+        and infinity. On a GPU this check would have to wait for the values.
 
         Args:
             joints: positions (*b, h) [rad or m] of the h actuated joints.

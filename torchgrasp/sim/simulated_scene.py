@@ -245,7 +245,8 @@ class SimulatedScene(abc.ABC):
 
     @checked
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
-        """Set the target of the mount's displacement beside approach and lift, until the next call.
+        """Set the target of the mount's displacement along the world's axes, until the next call.
+        It adds to approach and lift.
 
         Args:
             displacement: target displacement (3,) [m] in the world's frame.

@@ -248,9 +248,10 @@ class Certificate(Batch):
         residual: the largest component |W phi| (b,) of the balance found; infinite if there is
             none.
         witness: a unit wrench v (b, 6). If the margin is at most 0 or -inf, v . w >= 0 for every
-            edge wrench w, up to rounding. So no contact force opposes v. For a closed set, v proves
-            that no greater margin is possible. The margin is -min(v . w) / sum(v . w - min(v . w))
-            over the edge wrenches. If only the rank is too low, the wrenches are smallest along v.
+            edge wrench w, up to rounding. So no contact force opposes v. For a set with force
+            closure, v proves that no greater margin is possible. The margin is -min(v . w) / sum(v
+            . w - min(v . w)) over the edge wrenches. If only the rank is too low, the wrenches are
+            smallest along v.
         task_load: the load t (b, 6) that the contacts resist least, of the loads in the argument
             `resist` of `plan_grasps`. It is a force [N], then a torque [N m] about the contacts'
             centroid, in the frame of the cloud.
@@ -314,13 +315,13 @@ class IKSeeds(Batch):
 
     Attributes:
         joints: actuated joints (g, h) [rad or m], in the order of `hand.joint_names`.
-        obj_from_hand: pose (g, 4, 4) [m] of the hand in the frame of the contacts.
+        obj_from_hand: pose (g, 4, 4) [m] of the hand's root link in the frame of the contacts.
         row: index (g,) of the contact set of each guess.
         permutation: indices (g, f): in guess k finger i is placed on contact `permutation[k, i]` of
             its set.
         energy: misfit (g,) of the posture, without unit; less is better. For `nearest_postures` it
-            is half the squared distance between the features of posture and contacts. For a learned
-            model it is the least f_i of Eq. (21).
+            is half the squared distance between the features of posture and contacts
+            (`PostureLibrary.feature`). For a learned model it is the least f_i of Eq. (21).
         tip_error: distance (g, f) [m] of each fingertip from its contact.
     """
 

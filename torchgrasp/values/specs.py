@@ -114,7 +114,7 @@ class ContactSpec(Value):
     @checked
     def updated(self, result: ClosureResult) -> "ContactSpec":
         """Return this spec with the `friction` that a closing has measured
-        (`ClosureResult.friction`).
+        (`ClosureResult.friction`), to plan the next grasp.
 
         `result` is what `close_hand` returned. If its `friction` is None, the spec is returned as
         it is.
