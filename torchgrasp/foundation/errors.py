@@ -198,6 +198,10 @@ class TwoBodies(CloudWarning):
     """The cloud or the mesh shows two separate bodies."""
 
 
+class TableLeft(CloudWarning):
+    """The cloud holds points of the table around its object, which count as the object."""
+
+
 class FewPoints(CloudWarning):
     """The cloud has too few points to show a shape."""
 

@@ -20,6 +20,7 @@ from torchgrasp.arm.reach import reach_poses, with_arm
 from torchgrasp.cloud.agreement import check_shape, warn_of_low_table
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat
+from torchgrasp.cloud.surroundings import find_surroundings
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
 from torchgrasp.contacts.region import seen_from
 from torchgrasp.contacts.starts import (
@@ -137,7 +138,9 @@ class ShapedObject:
         # the surroundings of a scene's target
         obstacles = None
         vague = is_vague_cloud(cloud)
-        if scene is not None:
+        if scene is None:
+            vague = vague or _is_surrounded(shape, None if spec.table is None else 0.0)
+        else:
             vague = vague or bool(scene.covers) or bool(scene.doubts)
             scene = scene.to_upright(frame)
             if scene.target is not None:
@@ -488,6 +491,17 @@ def is_vague_cloud(cloud: PointCloud) -> bool:
     in_image = cloud.frustum is not None and cloud.viewpoint is not None
     cut = in_image and silhouettes(cloud.to("cpu")).cut
     return cut or len(cloud) < FEW_POINTS or is_flat(cloud.points)
+
+
+def _is_surrounded(shape: ShapeGP, table: float | None) -> bool:
+    """Return whether points of a table, at a height [m] or unknown, surround the object of a
+    shape.
+    """
+    cloud = shape.cloud
+    if cloud.normals is None:
+        return False
+    plane = None if table is None else Plane.horizontal(table)
+    return find_surroundings(cloud.points, cloud.normals, plane) > 0
 
 
 def is_buried(surface: Mesh, obstacles: Obstacles | None) -> bool:

@@ -12,10 +12,19 @@ from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, clean_cloud, prepare_cloud
+from torchgrasp.cloud.surroundings import find_surroundings
 from torchgrasp.data.accept import CloudLike, as_cloud
 from torchgrasp.foundation.base import join
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, CutOff, FewPoints, Flat, Gap, TwoBodies
+from torchgrasp.foundation.errors import (
+    BadArgument,
+    CutOff,
+    FewPoints,
+    Flat,
+    Gap,
+    TableLeft,
+    TwoBodies,
+)
 from torchgrasp.foundation.rules import LEAST, Positive, Range, Seed, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.foundation.told import warn_user
@@ -201,6 +210,8 @@ def fit_upright(
     noise = options.noise
     up = None if table is None else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32, device="cpu")
     seen = prepare_cloud(cloud, generator, clean=options.support == "camera", up=up)
+    if not in_image:  # a scene has cut its objects out
+        _warn_of_table(seen, None if table is None else Plane.horizontal(table))
     # The camera of a depth image is known, an estimated one is a guess, a whole surface has none.
     # It is judged after the outline, which refuses a camera within the points by that name.
     judged = seen.one_sided and not in_image and not seen.estimated
@@ -323,6 +334,17 @@ def condition(
     if is_known(posterior.factor):
         check_kernel(posterior, observations.least_noise)
     return ShapeGP.of(posterior, normalisation, cloud, psi, std_factor)
+
+
+def _warn_of_table(seen: PreparedCloud, table: Plane | None) -> None:
+    """Warn if points of the table, which may be unknown, surround the object."""
+    share = find_surroundings(seen.points, seen.normals, table)
+    if share > 0:
+        warn_user(
+            TableLeft,
+            f"{share:.0%} of the points are a table around the object, and count as the object: "
+            "give the object alone (cut_object), or plan on Scene.from_cloud",
+        )
 
 
 def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> None:

@@ -1,0 +1,94 @@
+"""A table that was left around an object is told, with its share of the points, in any frame."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from torchgrasp import ContactSpec, load_hand, load_object
+from torchgrasp.cloud import look_at, partial_view
+from torchgrasp.cloud.surroundings import find_surroundings
+from torchgrasp.foundation.errors import TableLeft
+from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.planner.objects import ShapedObject
+from torchgrasp.planner.request import Request
+from torchgrasp.values.planning import PointCloud
+
+TABLE = Plane.horizontal(0.0)
+
+
+def patch(inner, outer, count=600):
+    """Points of a table, 1 mm rough, between two squares of half sides `inner` and `outer` [m]."""
+    draw = np.random.default_rng(0)
+    points = draw.uniform(-outer, outer, (40 * count, 3))
+    points = points[np.abs(points[:, :2]).max(1) > inner][:count]
+    points[:, 2] = 0.001 * draw.normal(size=len(points))
+    return torch.from_numpy(points)
+
+
+def with_patch(name, outer=0.12):
+    """The view of a shipped object, and points of the table around it."""
+    view = load_object(name).view
+    around = patch(0.06, outer)
+    return PointCloud(torch.cat([view.points.double(), around]), None, view.viewpoint.double())
+
+
+def normals_of(points, eye):
+    """Unit vectors to the camera: the side that it sees, as far as this is needed here."""
+    away = eye - points
+    return away / away.norm(dim=-1, keepdim=True)
+
+
+@pytest.mark.parametrize("name", ["cylinder", "spray"])
+def test_the_share_of_a_table_is_told_in_any_frame(name):
+    cloud = with_patch(name)
+    share = 600 / len(cloud)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(cloud), 3)
+    assert find_surroundings(cloud.points, up, TABLE) == pytest.approx(share, abs=0.1)
+    motion = look_at(70.0, 20.0, 1.3)
+    moved = apply(motion, cloud.points)
+    found = find_surroundings(moved, rotate(motion, up), None)
+    assert found == pytest.approx(share, abs=0.1)
+
+
+@pytest.mark.parametrize("elevation", [25.0, 60.0, 85.0])
+@pytest.mark.parametrize("name", ["tray", "box", "glasses", "lid"])
+def test_what_an_object_has_low_down_is_no_table(name, elevation):
+    """A thin base within walls, a box alone, legs to one side, a lid above its pot."""
+    box = trimesh.creation.box
+    parts = {
+        "tray": [
+            box((0.2, 0.2, 0.003), trimesh.transformations.translation_matrix([0, 0, 0.0015])),
+            *(
+                box(size, trimesh.transformations.translation_matrix(place))
+                for size, place in (
+                    ((0.2, 0.004, 0.03), (0, 0.1, 0.015)),
+                    ((0.2, 0.004, 0.03), (0, -0.1, 0.015)),
+                    ((0.004, 0.2, 0.03), (0.1, 0, 0.015)),
+                    ((0.004, 0.2, 0.03), (-0.1, 0, 0.015)),
+                )
+            ),
+        ],
+        "box": [box((0.08, 0.06, 0.1), trimesh.transformations.translation_matrix([0, 0, 0.05]))],
+        "glasses": [
+            box((0.14, 0.004, 0.04), trimesh.transformations.translation_matrix([0, 0, 0.02])),
+            box((0.005, 0.13, 0.003), trimesh.transformations.translation_matrix([0.07, 0.06, 0])),
+            box((0.005, 0.13, 0.003), trimesh.transformations.translation_matrix([-0.07, 0.06, 0])),
+        ],
+        "lid": [
+            trimesh.creation.cylinder(0.1, 0.12).apply_translation((0, 0, 0.06)),
+            trimesh.creation.cylinder(0.015, 0.05).apply_translation((0, 0, 0.145)),
+        ],
+    }
+    mesh = trimesh.util.concatenate(parts[name])
+    pose = look_at(20.0, elevation, 0.6, mesh)
+    cloud = partial_view(mesh, pose, 1500)
+    points = cloud.points.double()
+    assert find_surroundings(points, normals_of(points, pose[:3, 3]), TABLE) == 0
+
+
+def test_a_plan_tells_it_and_its_success_is_unknown():
+    request = Request(with_patch("cylinder"), load_hand("barrett"), ContactSpec(table=0.0))
+    with pytest.warns(TableLeft, match="% of the points are a table around the object"):
+        assert ShapedObject.of(request).vague

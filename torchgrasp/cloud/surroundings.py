@@ -1,0 +1,117 @@
+"""Points of a table that were left around an object in its cloud."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.cloud.neighbours import draw_rows
+from torchgrasp.foundation.lazy import spatial
+from torchgrasp.geometry.linalg import Points, across
+from torchgrasp.geometry.plane import Plane
+
+
+@dataclasses.dataclass(frozen=True)
+class SurroundingNumbers:
+    """Bounds by which points are those of a table around an object."""
+
+    layer: float = 0.004
+    """Half thickness [m] of a table's layer: a depth camera's noise at half a metre."""
+    risen: float = 0.015
+    """Least height [m] of an object's points above the table that count."""
+    fewest: int = 20
+    """Fewest such points, and fewest points of the table."""
+    beyond: float = 0.02
+    """Least distance [m] of the table's points from the object's outline, seen from above: a foot
+    is hardly wider than the rest.
+    """
+    share: float = 0.1
+    """Least share of all points that are on the table and so far from the object."""
+    sectors: int = 12
+    """Equal sectors around the object, seen from above."""
+    sides: float = 0.55
+    """Least share of the sectors with points of the table: the object hides some, and legs
+    lie on fewer.
+    """
+    planes: int = 64
+    """Planes through points that are tried where the table is unknown."""
+    fits: int = 3
+    """Fits of the best of these planes to the points near it."""
+    below: float = 0.02
+    """Greatest share of points below such a plane: below a table nothing is seen."""
+
+
+SURROUNDINGS = SurroundingNumbers()
+
+
+def find_surroundings(points: Points, normals: Points, table: Plane | None) -> float:
+    """Return the share of points that are those of a table around an object; 0 if there is none.
+
+    The `normals` (n, 3) of the points (n, 3) [m] face the camera. With a `table` of None, planes
+    with many of the points are tried.
+    """
+    points = points.double().cpu()
+    if table is not None:
+        return _share_around(points, table)
+    return _share_around_some(points, normals.double().cpu())
+
+
+def _share_around(points: Points, table: Plane) -> float:
+    """Return the share of points (n, 3) [m] on a table around an object; 0 if they do not surround
+    it.
+    """
+    height = table.height(points)
+    on = points[height.abs() < SURROUNDINGS.layer]
+    risen = points[height > SURROUNDINGS.risen]
+    if min(len(on), len(risen)) < SURROUNDINGS.fewest:
+        return 0.0
+    axes = torch.stack(across(table.normal.to(points)), -1)  # (3, 2)
+    # seen from above: the convex outline of the object
+    outline = spatial.ConvexHull((risen @ axes).numpy(), qhull_options="QJ")
+    sides = torch.from_numpy(outline.equations).to(points)  # (k, 3)
+    flat = on @ axes
+    outside = (flat @ sides[:, :2].T + sides[:, 2]).amax(1)
+    far = flat[outside > SURROUNDINGS.beyond] - (risen @ axes).mean(0)
+    share = len(far) / len(points)
+    turn = torch.atan2(far[:, 1], far[:, 0]) / (2 * torch.pi) + 0.5
+    sector = (turn * SURROUNDINGS.sectors).long().clamp_max(SURROUNDINGS.sectors - 1)
+    seen = len(sector.unique()) / SURROUNDINGS.sectors
+    return share if share >= SURROUNDINGS.share and seen >= SURROUNDINGS.sides else 0.0
+
+
+def _share_around_some(points: Points, normals: Points) -> float:
+    """Return the share of points (n, 3) [m] on the plane with most of them, if it is a table around
+    an object.
+
+    The object rises from it towards the camera, which the `normals` (n, 3) face. Else the result is
+    0.
+    """
+    rows = draw_rows(len(points), SURROUNDINGS.planes)
+    normal = normals[rows]  # (m, 3)
+    height = points @ normal.T - (normal * points[rows]).sum(-1)  # (n, m)
+    # nothing is seen below a table: this leaves out the sides of objects
+    allowed = _share_below(height) <= SURROUNDINGS.below
+    count = torch.where(allowed, (height.abs() < SURROUNDINGS.layer).sum(0), 0)
+    best = int(count.argmax())
+    plane = Plane(normal[best], float(normal[best] @ points[rows[best]]))
+    for _ in range(SURROUNDINGS.fits):
+        layer = plane.height(points).abs() < SURROUNDINGS.layer
+        if int(layer.sum()) < SURROUNDINGS.fewest:
+            return 0.0
+        plane = _fit(points[layer], normal[best])
+    below = _share_below(plane.height(points))
+    return _share_around(points, plane) if below <= SURROUNDINGS.below else 0.0
+
+
+def _share_below(height: Float[Tensor, "n *m"]) -> Float[Tensor, "*m"]:
+    """Return the share of n heights [m] that are clearly below 0, for each of m planes."""
+    return (height < -SURROUNDINGS.risen).double().mean(0)
+
+
+def _fit(points: Points, towards: Float[Tensor, "3"]) -> Plane:
+    """Return the plane through points (n, 3) [m] whose normal is on the side of `towards`."""
+    middle = points.mean(0)
+    normal = torch.linalg.svd(points - middle, full_matrices=False).Vh[2]
+    normal = torch.where(normal @ towards < 0, -normal, normal)
+    return Plane(normal, float(normal @ middle))
