@@ -52,29 +52,31 @@ def test_the_share_of_a_table_is_told_in_any_frame(name):
     assert found == pytest.approx(share, abs=0.1)
 
 
+def boxed(size, middle):
+    """A box of sides `size` [m] around a place."""
+    return trimesh.creation.box(size, trimesh.transformations.translation_matrix(middle))
+
+
 @pytest.mark.parametrize("elevation", [25.0, 60.0, 85.0])
 @pytest.mark.parametrize("name", ["tray", "box", "glasses", "lid"])
 def test_what_an_object_has_low_down_is_no_table(name, elevation):
     """A thin base within walls, a box alone, legs to one side, a lid above its pot."""
-    box = trimesh.creation.box
+    wall = (0.2, 0.004, 0.03)
+    side = (0.004, 0.2, 0.03)
+    leg = (0.005, 0.13, 0.003)
     parts = {
         "tray": [
-            box((0.2, 0.2, 0.003), trimesh.transformations.translation_matrix([0, 0, 0.0015])),
-            *(
-                box(size, trimesh.transformations.translation_matrix(place))
-                for size, place in (
-                    ((0.2, 0.004, 0.03), (0, 0.1, 0.015)),
-                    ((0.2, 0.004, 0.03), (0, -0.1, 0.015)),
-                    ((0.004, 0.2, 0.03), (0.1, 0, 0.015)),
-                    ((0.004, 0.2, 0.03), (-0.1, 0, 0.015)),
-                )
-            ),
+            boxed((0.2, 0.2, 0.003), (0, 0, 0.0015)),
+            boxed(wall, (0, 0.1, 0.015)),
+            boxed(wall, (0, -0.1, 0.015)),
+            boxed(side, (0.1, 0, 0.015)),
+            boxed(side, (-0.1, 0, 0.015)),
         ],
-        "box": [box((0.08, 0.06, 0.1), trimesh.transformations.translation_matrix([0, 0, 0.05]))],
+        "box": [boxed((0.08, 0.06, 0.1), (0, 0, 0.05))],
         "glasses": [
-            box((0.14, 0.004, 0.04), trimesh.transformations.translation_matrix([0, 0, 0.02])),
-            box((0.005, 0.13, 0.003), trimesh.transformations.translation_matrix([0.07, 0.06, 0])),
-            box((0.005, 0.13, 0.003), trimesh.transformations.translation_matrix([-0.07, 0.06, 0])),
+            boxed((0.14, 0.004, 0.04), (0, 0, 0.02)),
+            boxed(leg, (0.07, 0.06, 0)),
+            boxed(leg, (-0.07, 0.06, 0)),
         ],
         "lid": [
             trimesh.creation.cylinder(0.1, 0.12).apply_translation((0, 0, 0.06)),
@@ -82,6 +84,7 @@ def test_what_an_object_has_low_down_is_no_table(name, elevation):
         ],
     }
     mesh = trimesh.util.concatenate(parts[name])
+    assert isinstance(mesh, trimesh.Trimesh)
     pose = look_at(20.0, elevation, 0.6, mesh)
     cloud = partial_view(mesh, pose, 1500)
     points = cloud.points.double()
