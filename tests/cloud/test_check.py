@@ -1,10 +1,20 @@
+import numpy as np
 import pytest
 import torch
 
 from tests.make import real
-from torchgrasp.cloud.check import check_cloud, remove_duplicates, remove_outliers, voxel_downsample
+from torchgrasp.cloud.check import (
+    check_cloud,
+    coordinate_step,
+    remove_duplicates,
+    remove_outliers,
+    voxel_downsample,
+    warn_of_step,
+)
+from torchgrasp.cloud.diagnose import diagnose_cloud
+from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.data.shipped import list_objects, load_object
-from torchgrasp.foundation.errors import BadArgument, SuspiciousScale, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, CloudWarning, SuspiciousScale, TooFewPoints
 from torchgrasp.values.planning import PointCloud
 
 
@@ -141,3 +151,28 @@ def test_remove_outliers_removes_hardly_anything_else(name):
     clean = remove_outliers(PointCloud(torch.cat([view.points, far]), None, view.viewpoint))
     assert not bool((torch.cdist(clean.points, far) == 0).any())
     assert len(clean) > 0.96 * len(view) and torch.equal(clean.viewpoint, view.viewpoint)
+
+
+def rounded(points, digits):
+    return torch.from_numpy(np.round(points.numpy(), digits))
+
+
+def test_coordinates_of_large_steps_are_told():
+    """Far from the origin float32 has few digits, as a text of two decimals has."""
+    points = 0.1 * torch.rand(200, 3, generator=torch.Generator().manual_seed(0)).double()
+    far = points + torch.tensor([432_100.0, 5_412_300.0, 230.0]).double()
+    assert coordinate_step(points) == coordinate_step(far) == 0.0
+    assert coordinate_step(far.float()) == 0.5  # 2**-23 of a number from 2**22 on
+    assert coordinate_step((points + 40_000.0).float()) == 2.0**-8
+    assert coordinate_step(points.float()) == coordinate_step(rounded(points, 3)) == 0.0
+    assert coordinate_step(rounded(points, 2)) == 0.01
+    for cloud in (PointCloud(rounded(points, 2)), PointCloud((points + 70_000.0).float())):
+        assert any("coordinates in steps of" in str(x) for x in diagnose_cloud(cloud).advice)
+        with pytest.warns(CloudWarning, match=r"points: coordinates in steps of \d+"):
+            warn_of_step(cloud)
+
+
+def test_a_ply_far_from_the_origin_keeps_its_digits(tmp_path):
+    far = 0.1 * torch.rand(200, 3, generator=torch.Generator().manual_seed(0)).double() + 432_100.0
+    read = read_cloud(save_cloud(PointCloud(far), tmp_path / "far.ply"))
+    assert torch.equal(read.points, far)

@@ -13,6 +13,7 @@ from torchgrasp.cloud.prepare import (
     clean_cloud,
     compare_normals,
     estimate_normals,
+    lie_across,
     point_inward,
     prepare_cloud,
     share_facing,
@@ -275,3 +276,31 @@ def test_normals_to_the_middle_are_told_where_no_camera_shows_their_side(name):
         prepare_cloud(cloud, torch.Generator())
         with pytest.warns(CloudWarning, match="normals: they point to the middle"):
             prepare_cloud(inward, torch.Generator())
+
+
+WRONG = {
+    "one direction": lambda points: torch.zeros_like(points).index_fill(1, torch.tensor([2]), 1.0),
+    "colours": lambda points: torch.rand(points.shape, generator=torch.Generator().manual_seed(0)),
+    "one colour": lambda points: torch.full_like(points, 128.0),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_vectors_across_the_surface_are_no_normals_and_told(name):
+    view = load_object("cylinder").view
+    points = view.points.double()
+    given = PointCloud(points, WRONG[name](points).double())
+    generator = torch.Generator().manual_seed(0)
+    with pytest.warns(CloudWarning, match=r"normals: they are across the surface .* or None"):
+        prepare_cloud(given, generator)
+    assert any("across the surface" in one.found for one in diagnose_cloud(given).advice)
+
+
+@pytest.mark.parametrize("count", [100, 400])
+@pytest.mark.parametrize("noise", [0.0, 0.004])
+def test_normals_of_few_and_noisy_points_are_not_taken_for_colours(count, noise):
+    mesh = load_object("rabbit").mesh
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
+    points = points + noise * np.random.default_rng(0).normal(size=points.shape)
+    normals = torch.from_numpy(mesh.face_normals[faces].copy())
+    assert not lie_across(torch.from_numpy(points), normals)

@@ -30,6 +30,7 @@ def patch(inner, outer, count=600):
 def with_patch(name, outer=0.12):
     """The view of a shipped object, and points of the table around it."""
     view = load_object(name).view
+    assert view.viewpoint is not None
     around = patch(0.06, outer)
     return PointCloud(torch.cat([view.points.double(), around]), None, view.viewpoint.double())
 

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from torchgrasp.cloud.neighbours import find_inliers
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, SuspiciousScale, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, CloudWarning, SuspiciousScale, TooFewPoints
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.foundation.rules import Range
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.linalg import Points, norm, number_rows
 from torchgrasp.values.planning import PointCloud
 
@@ -40,6 +41,12 @@ class CloudNumbers:
     """Greatest extent, read as metres, that is taken for cm: that of an object of at most 45 cm. A
     larger one is taken for mm.
     """
+    digit: float = 0.01
+    """Step [m] of coordinates that were rounded to two decimals."""
+    equal: float = 1e-6
+    """Greatest error of a coordinate that is rounded to such a step, over the step."""
+    coarse: float = 0.002
+    """Least step [m] of coordinates that is told: its rounding is as large as a camera's noise."""
     farthest: float = 50.0
     """Greatest distance [m] of a camera; depth images measure no farther, and one in cm is."""
 
@@ -164,6 +171,40 @@ def _check(cloud: PointCloud) -> Points:
             allowed = f"a camera within {CLOUD.farthest:g} m of the points, in metres as they are"
             raise BadArgument("viewpoint", f"one {away:.4g} m away", allowed)
     return points
+
+
+def coordinate_step(points: Points) -> float:
+    """Return the step [m] to which all coordinates (n, 3) [m] are rounded; 0 if it is too small to
+    tell, or the points are too few.
+
+    Numbers in float32 have large steps far from the origin, and texts of two decimals have others.
+    """
+    found = points.detach().double().cpu()
+    if len(found) < FEW_POINTS:
+        return 0.0
+    step = 0.0
+    single = found.float()
+    if bool((single.double() == found).all()):
+        farthest = single.abs().max()
+        beyond = torch.nextafter(farthest, torch.full_like(farthest, torch.inf))
+        step = float(beyond) - float(farthest)
+    counts = found / CLOUD.digit
+    if bool(((counts - counts.round()).abs() < CLOUD.equal).all()):
+        step = max(step, CLOUD.digit)
+    return step if step >= CLOUD.coarse else 0.0
+
+
+def describe_step(step: float) -> str:
+    """Return words that say to which step [m] the coordinates of a cloud are rounded."""
+    return f"coordinates in steps of {1e3 * step:.2g} mm, of few digits or far from the origin"
+
+
+def warn_of_step(cloud: PointCloud) -> None:
+    """Warn of a cloud whose coordinates are rounded to a large step."""
+    step = coordinate_step(cloud.points)
+    if step > 0:
+        fix = "give more digits, or subtract an offset in float64 before float32 is written"
+        warn_user(CloudWarning, f"points: {describe_step(step)}; {fix}")
 
 
 def _guess_unit(extent: float) -> str:

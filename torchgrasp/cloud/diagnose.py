@@ -9,15 +9,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.advice import Advice, judge_view
-from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
+from torchgrasp.cloud.check import (
+    FEW_POINTS,
+    coordinate_step,
+    describe_step,
+    remove_duplicates,
+)
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_local_planes, is_flat, nearest
 from torchgrasp.cloud.pixels import PIXELS, find_pixel_camera
 from torchgrasp.cloud.prepare import (
+    ACROSS,
     FACING,
     MAX_POINTS,
     NormalCheck,
     clean_cloud,
     compare_normals,
+    lie_across,
     share_facing,
 )
 from torchgrasp.cloud.viewpoint import guess_viewpoint
@@ -140,7 +147,9 @@ def diagnose_cloud(
 
     view = some.select(draw_rows(len(some), DIAGNOSIS.viewed))
     check = None
+    across = False
     if view.normals is not None:
+        across = lie_across(view.points.double(), view.normals.double())
         check = compare_normals(view.points.double(), view.normals.double())
         if not check.oriented:
             view = PointCloud(view.points, None, view.viewpoint)
@@ -171,7 +180,10 @@ def diagnose_cloud(
         advice=(),
     )
     advice = judge_view(view, clean, vertical, table, stands)
-    return dataclasses.replace(report, advice=(*advice, *_advise(report, is_flat(points), angle)))
+    return dataclasses.replace(
+        report,
+        advice=(*advice, *_advise(report, is_flat(points), angle, across, coordinate_step(points))),
+    )
 
 
 def _guess_camera(
@@ -207,9 +219,14 @@ def format_report(report: CloudReport) -> str:
     return render(Path(__file__).parent / "templates" / "report.txt.jinja", report=report)
 
 
-def _advise(report: CloudReport, flat: bool, angle: float) -> list[Advice]:
+def _advise(
+    report: CloudReport, flat: bool, angle: float, across: bool, step: float
+) -> list[Advice]:
     """Return advice on size, density, noise, outliers, flatness, normals, and a camera uncertain by
     `angle` [deg].
+
+    `across` is whether the normals lie across the surface. `step` [m] is that to which all
+    coordinates are rounded, or 0.
     """
     longest = max(report.size)
     outliers = report.outliers / report.points
@@ -239,7 +256,9 @@ def _advise(report: CloudReport, flat: bool, angle: float) -> list[Advice]:
         (report.points - report.copies < FEW_POINTS, few, "a denser cloud"),
         (report.spacing > DIAGNOSIS.sparse * longest, sparse, "a denser cloud"),
         (report.noise > DIAGNOSIS.noise, blurred, "a nearer camera"),
+        (step > 0, describe_step(step), "more digits, or less an offset"),
         (flat, plane, "a view of two sides"),
+        (across, f"normals {ACROSS}", "outward ones, or none: --no-normals"),
         (oriented and flipped > DIAGNOSIS.flipped, turned, "none: --no-normals"),
         (not oriented, "normals of random signs, which are ignored", "none: --no-normals"),
         (guessed, guess, "--viewpoint X Y Z"),

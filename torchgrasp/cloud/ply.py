@@ -28,6 +28,7 @@ TYPES = {
 SHAPES = {"viewpoint": (3,), "frustum": (4, 3), "table": (4,)}
 """Shapes of the arrays in comments."""
 SAMPLED = 2000  # points on the surface of a mesh
+ROUNDING = 1e-5  # greatest rounding [m] of coordinates that are written in float32
 Property = tuple[str, str, str]  # name, type, and type of the length if it is a list
 
 
@@ -90,17 +91,20 @@ def format_ply(
     """Return the bytes of a binary PLY file of a cloud.
 
     `points` and `normals` are (n, 3). Comment lines hold the `viewpoint` (3,), the `frustum` (4, 3)
-    of inward normals, and the `table` (4,), normal and offset. Lengths are in metres.
+    of inward normals, and the `table` (4,), normal and offset. Lengths are in metres. Numbers are
+    in float32; far from the origin, where that is too coarse, they are in float64.
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     for name, numbers in (("viewpoint", viewpoint), ("frustum", frustum), ("table", table)):
         if numbers is not None:
             lines.append(f"comment {name} " + " ".join(repr(float(x)) for x in numbers.flat))
     lines.append(f"element vertex {len(points)}")
+    coarse = float(np.spacing(np.abs(points).max(initial=0.0).astype(np.float32))) / 2
+    kind, code = ("double", "<f8") if coarse > ROUNDING else ("float", "<f4")
     names = ["x", "y", "z"] + (["nx", "ny", "nz"] if normals is not None else [])
-    lines += [f"property float {name}" for name in names]
+    lines += [f"property {kind} {name}" for name in names]
     rows = points if normals is None else np.concatenate([points, normals], axis=1)
-    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + rows.astype("<f4").tobytes()
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + rows.astype(code).tobytes()
 
 
 def _split_header(data: bytes) -> tuple[list[str], bytes]:

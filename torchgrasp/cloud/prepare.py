@@ -10,7 +10,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
-from torchgrasp.cloud.neighbours import find_inliers, fit_local_planes, fit_quadrics, nearest
+from torchgrasp.cloud.neighbours import (
+    NEAR,
+    draw_rows,
+    find_inliers,
+    fit_local_planes,
+    fit_quadrics,
+    nearest,
+)
 from torchgrasp.cloud.pixels import find_pixel_camera
 from torchgrasp.cloud.pose import Transform, check_rigid
 from torchgrasp.cloud.registration import align_views, compare_views
@@ -24,6 +31,7 @@ from torchgrasp.geometry.linalg import Points, Vector, dot, norm, unit, unit_of_
 from torchgrasp.values.planning import PointCloud
 
 FACING = 0.9  # least share of a view's normals that face the camera; noise turns some at the rim
+ACROSS = "across the surface of the points (colours?)"
 INWARD = "to the middle of the points: give outward ones, or none, unless only a hollow is seen"
 MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time of the selection
 
@@ -60,6 +68,16 @@ class NormalNumbers:
     """Signs of which this share is opposed are not trusted; random ones oppose half."""
     rounded: float = 1e-3
     """Greatest error of a unit length: text files round to three digits."""
+    across: float = 0.7
+    """Least median |cosine| between normals and planes fitted to the points. Random directions have
+    a half; normals have more, also of few and noisy points.
+    """
+    alike: float = 0.999
+    """Least cosine of nearly all vectors with their median if they are alike, as one colour is."""
+    nearly: float = 0.9
+    """Share of the vectors that are nearly all."""
+    drawn: int = 2000
+    """Most points at which normals are compared with these planes."""
     inward: float = 0.05
     """Mean cosine between normals and the way to the middle, weighted with its length. Above this,
     normals point inward; in a flat view it is 0.
@@ -123,7 +141,8 @@ def prepare_cloud(
     random signs, with which a single view would look like a whole surface. With `clean`, outliers
     are removed, and the other points are moved onto quadrics fitted around them. All normals are
     fitted anew. Also with `clean`, a viewpoint that too few given normals face counts as missing.
-    If these are the normals of one side, `NoEffect` warns of it. With `clean`, a missing viewpoint
+    If these are the normals of one side, `NoEffect` warns of it. Vectors across the surface, which
+    are no normals, raise a `CloudWarning`. With `clean`, a missing viewpoint
     is that of `find_pixel_camera`, if its pixels show it. `up` is the upward direction, or None.
     Else, and where normals are fitted, it is estimated by `guess_viewpoint`. Raises the errors of
     `check_cloud`. Raises `BadArgument` for more than 16 cameras or normals that point away from the
@@ -141,6 +160,8 @@ def prepare_cloud(
             allowed = f"at least {PREPARE.points} points of each view"
             raise TooFewPoints("points", f"{count.min()} points of one view", allowed)
     if normals is not None:
+        if lie_across(cloud.points.double(), normals.double()):
+            warn_user(CloudWarning, f"normals: they are {ACROSS}; give outward ones, or None")
         if not compare_normals(cloud.points.double(), normals.double()).oriented:
             normals = None
         elif viewpoint is not None:
@@ -269,6 +290,24 @@ def compare_normals(points: Points, normals: Points) -> NormalCheck:
         oriented=opposed < NORMALS.random,
         scaled=int((error > NORMALS.rounded).sum()),
     )
+
+
+def lie_across(points: Points, normals: Points) -> bool:
+    """Return whether vectors (n, 3) lie across the surface of their `points` (n, 3) [m].
+
+    Then they are no normals, such as colours, or one direction for all points.
+    """
+    if len(points) < NEAR.plane:
+        return False  # too few for planes
+    rows = draw_rows(len(points), NORMALS.drawn).to(points.device)
+    planes, _ = fit_local_planes(points, rows)
+    given = unit_of_any(normals[rows])
+    cosine = (planes * given).sum(-1).abs()
+    usual = unit_of_any(given.median(0).values)
+    alike = float(((given @ usual) > NORMALS.alike).double().mean()) >= NORMALS.nearly
+    # most points of one colour may lie on the one face of which it is the normal
+    least = cosine.quantile(1 - NORMALS.nearly) if alike else cosine.median()
+    return float(least) < NORMALS.across
 
 
 def point_inward(points: Points, normals: Points) -> bool:

@@ -239,7 +239,9 @@ def cloud_from_array(
 
 @checked
 def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) -> Path:
-    """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically; return the path.
+    """Write a cloud as `.npz` (exact) or binary `.ply`, atomically; return the path.
+
+    A `.ply` has numbers in float32, or in float64 where float32 is rounded by over 0.01 mm.
 
     Args:
         cloud: the points [m]. Their normals, cameras and errors are also written.

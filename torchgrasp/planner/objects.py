@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchgrasp.arm.reach import reach_poses, with_arm
 from torchgrasp.cloud.agreement import check_shape, warn_of_low_table
-from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
+from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates, warn_of_step
 from torchgrasp.cloud.neighbours import is_flat
 from torchgrasp.cloud.surroundings import find_surroundings
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
@@ -120,6 +120,7 @@ class ShapedObject:
                 spec, table=scene.table if spec.table is None else spec.table
             )
         cloud = remove_duplicates(cloud)
+        warn_of_step(cloud)
         frame = upright_frame(cloud.points, cloud.viewpoint, spec.plane)
         # shaped: the Gaussian process, its surface and the distances from the surface
         shape = request.shape

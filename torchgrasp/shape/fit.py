@@ -8,7 +8,7 @@ import torch
 
 from torchgrasp.cloud.advice import check_camera
 from torchgrasp.cloud.agreement import check_foot, warn_of_low_table
-from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
+from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates, warn_of_step
 from torchgrasp.cloud.neighbours import is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, clean_cloud, prepare_cloud
@@ -154,6 +154,7 @@ def fit_shape(
         )
     plane = as_plane(table)
     cloud = remove_duplicates(cloud)
+    warn_of_step(cloud)
     frame = upright_frame(cloud.points, cloud.viewpoint, plane)
     options = FitOptions(noise, budget, psi_scale, support, kernel, criterion)
     return fit_upright(
