@@ -129,6 +129,27 @@ def test_a_normalised_mesh_and_bodies_that_lie_apart_are_told(tmp_path):
     write_objects(joined, tmp_path / "c", views=1)  # without a word
 
 
+def test_a_mesh_that_falls_over_is_told(tmp_path):
+    """A hammer with y up lies on its head; lying cylinders and balls stay where they are."""
+    head = trimesh.creation.box((0.03, 0.03, 0.08))
+    shaft = trimesh.creation.box((0.2, 0.02, 0.02)).apply_translation((0.11, 0, 0.02))
+    rolling = trimesh.creation.cylinder(0.03, 0.1).apply_transform(
+        trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
+    )
+    things = {
+        "hammer": trimesh.util.concatenate([head, shaft]),
+        "can": rolling,
+        "ball": trimesh.creation.icosphere(2, 0.03),
+    }
+    for name, thing in things.items():
+        (tmp_path / name).mkdir()
+        thing.export(tmp_path / name / "thing.ply")
+    with pytest.warns(CloudWarning, match=r"falls over as it lies: .* mm beside its foot"):
+        write_objects(tmp_path / "hammer", tmp_path / "a", views=1)
+    for name in ("can", "ball"):  # without a word
+        write_objects(tmp_path / name, tmp_path / f"{name} out", views=1)
+
+
 def test_no_meshes_two_of_a_name_and_an_open_one_are_refused(tmp_path: Path):
     with pytest.raises(BadArgument, match="meshes"):
         write_objects(tmp_path, tmp_path / "out")

@@ -52,11 +52,24 @@ def one_turned(faces):
         (changed(faces=one_turned), "volume"),
         (
             trimesh.util.concatenate([cube(), turned(cube(0.08)).apply_translation((0.3, 0, 0))]),
-            "without inertia",
+            "512 cm.3 turned inward",
+        ),
+        (
+            trimesh.util.concatenate([cube(), turned(cube(0.03)).apply_translation((0.06, 0, 0))]),
+            "27 cm.3 turned inward, in no other body",
         ),
         (trimesh.Trimesh(), "of 0 faces"),
     ],
-    ids=["open", "inside out", "not finite", "flat", "one face turned", "one body turned", "empty"],
+    ids=[
+        "open",
+        "inside out",
+        "not finite",
+        "flat",
+        "one face turned",
+        "one body turned",
+        "handle turned",
+        "empty",
+    ],
 )
 def test_read_mesh_refuses_what_is_no_body(mesh, reason):
     with pytest.raises(MeshError, match=reason):

@@ -56,7 +56,20 @@ class CameraNumbers:
     """Number of random seeds among which the seed of a view's noise is drawn."""
 
 
+@dataclasses.dataclass(frozen=True)
+class StandNumbers:
+    """Bounds by which a mesh cannot stand as it lies."""
+
+    foot: float = 0.001
+    """Greatest height [m] of the vertices of its foot over the lowest one."""
+    beside: float = 0.002
+    """Least distance [m] of its mass centre from its foot, seen from above."""
+    directions: int = 360
+    """Directions in which the mass centre may be beside the foot."""
+
+
 CAMERAS = CameraNumbers()
+STAND = StandNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,8 +158,8 @@ def write_objects(
         views: number of views of each object.
         seed: seed of the camera directions and of the noise.
 
-    Warns of a mesh that is too large for a hand (`CloudWarning`), and of bodies that lie apart
-    (`TwoBodies`).
+    Warns of a mesh that is too large for a hand or falls over (`CloudWarning`), and of bodies that
+    lie apart (`TwoBodies`).
 
     Raises:
         DatasetError: there are no meshes, or two meshes of one name.
@@ -198,11 +211,15 @@ def _write_object(
 
 
 def _warn_of_object(name: str, mesh: "trimesh.Trimesh") -> None:
-    """Warn of a mesh that is large for a hand, or has bodies whose boxes lie apart."""
+    """Warn of a mesh that is large for a hand, falls over, or has bodies whose boxes lie apart."""
     longest = float(mesh.extents.max())
     if longest > DIAGNOSIS.long:
         fix = 'if it is normalised, scale it, or write "suggested_scale" into the manifest'
         warn_user(CloudWarning, f"{name} is {longest:.2f} m long, too large for a hand: {fix}")
+    beside = _beside_foot(mesh)
+    if beside > STAND.beside:
+        off = f"its mass centre is {1e3 * beside:.0f} mm beside its foot"
+        warn_user(CloudWarning, f"{name} falls over as it lies: {off}. Is z up?")
     left = [part.bounds for part in mesh.split(only_watertight=False)]
     joined = left.pop()
     # bodies whose boxes meet are joined, until none is near the first
@@ -212,6 +229,18 @@ def _warn_of_object(name: str, mesh: "trimesh.Trimesh") -> None:
         left = [box for k, box in enumerate(left) if k not in near]
     if left:
         warn_user(TwoBodies, f"{name} has bodies that lie apart, and counts as one rigid object")
+
+
+def _beside_foot(mesh: "trimesh.Trimesh") -> float:
+    """Return the distance [m] of a mesh's mass centre from its foot, seen from above; negative over
+    the foot.
+    """
+    vertices = np.asarray(mesh.vertices)
+    low = vertices[:, 2] < mesh.bounds[0, 2] + STAND.foot
+    foot = (vertices[low] - mesh.center_mass)[:, :2]
+    turn = np.linspace(0, 2 * np.pi, STAND.directions, endpoint=False)
+    away = np.stack([np.cos(turn), np.sin(turn)])  # (2, directions)
+    return -float((foot @ away).max(0).min())
 
 
 def _meet(first: np.ndarray, second: np.ndarray) -> bool:

@@ -29,6 +29,7 @@ SUFFIXES = (".obj", ".off", ".ply", ".stl")
 _REFERENCE = re.compile(rb"/\S*")
 MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12  # least volume [m^3] of a body
+MOST_INWARD = 100  # most bodies turned inward that are looked at, the largest ones
 LEAST_SPAN = 1e-40  # least squared double area [m4] of a triangle that is divided by
 STALE_NORMAL = 1e-4  # least difference of unit normals that no rounding of a file explains
 # a binary .stl: title, 32-bit count of faces, and bytes of each face
@@ -97,12 +98,41 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
         raise MeshError(
             "mesh", f"{name} of volume {volume:.3g} m^3", "a positive volume, faces turned outward"
         )
+    inward = _inward_volume(mesh)
+    if inward > LEAST_VOLUME:
+        found = f"{name} with a body of {1e6 * inward:.3g} cm^3 turned inward, in no other body"
+        raise MeshError("mesh", found, "every face turned outward, but those of a cavity")
     if not np.linalg.eigvalsh(mesh.moment_inertia).min() > 0:  # a simulator cannot move it
         raise MeshError(
             "mesh",
             f"{name} without inertia, as of a body turned inward",
             "every face turned outward",
         )
+
+
+def _inward_volume(mesh: "trimesh.Trimesh") -> float:
+    """Return the volume [m^3] of a body whose faces are turned inward, though it is no cavity; 0 if
+    there is none.
+
+    A cavity lies in the box of a body that is turned outward.
+    """
+    body = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
+    count = int(body.max()) + 1
+    if count == 1:
+        return 0.0
+    corners = np.asarray(mesh.vertices - mesh.vertices.mean(0))[mesh.faces]  # (f, 3 corners, 3)
+    a, b, c = corners.transpose(1, 0, 2)
+    volume = np.bincount(body, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, count)
+    low = np.full((count, 3), np.inf)
+    high = np.full((count, 3), -np.inf)
+    np.minimum.at(low, body, corners.min(1))
+    np.maximum.at(high, body, corners.max(1))
+    outward = volume > 0
+    for k in np.argsort(volume)[:MOST_INWARD].tolist():
+        inside = (low[outward] <= low[k]) & (high[k] <= high[outward])
+        if volume[k] < -LEAST_VOLUME and not inside.all(1).any():
+            return -float(volume[k])
+    return 0.0
 
 
 def with_true_normals(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
