@@ -64,6 +64,8 @@ class StandNumbers:
     """Greatest height [m] of the vertices of its foot over the lowest one."""
     beside: float = 0.002
     """Least distance [m] of its mass centre from its foot, seen from above."""
+    rocks: float = 0.1
+    """Greatest angle [rad] by which a mesh may turn until it stands, as scans that rock do."""
     directions: int = 360
     """Directions in which the mass centre may be beside the foot."""
 
@@ -232,15 +234,23 @@ def _warn_of_object(name: str, mesh: "trimesh.Trimesh") -> None:
 
 
 def _beside_foot(mesh: "trimesh.Trimesh") -> float:
-    """Return the distance [m] of a mesh's mass centre from its foot, seen from above; negative over
-    the foot.
+    """Return the distance [m] of a mesh's mass centre from its foot, seen from above.
+
+    It is negative over the foot, and 0 if the mesh stands after it rocks a little.
     """
-    vertices = np.asarray(mesh.vertices)
-    low = vertices[:, 2] < mesh.bounds[0, 2] + STAND.foot
-    foot = (vertices[low] - mesh.center_mass)[:, :2]
+    height = np.asarray(mesh.vertices[:, 2] - mesh.bounds[0, 2])
+    flat = np.asarray(mesh.vertices - mesh.center_mass)[:, :2]
+    foot = flat[height < STAND.foot]
     turn = np.linspace(0, 2 * np.pi, STAND.directions, endpoint=False)
     away = np.stack([np.cos(turn), np.sin(turn)])  # (2, directions)
-    return -float((foot @ away).max(0).min())
+    ends = (foot @ away).max(0)
+    falls = int(ends.argmin())
+    beside = -float(ends[falls])
+    # it turns about the end of its foot, until a vertex beyond its mass centre touches the table
+    along = flat @ away[:, falls]
+    beyond = along > 0
+    rocks = np.arctan2(height[beyond], along[beyond] + beside).min(initial=np.inf)
+    return min(beside, 0.0) if rocks < STAND.rocks else beside
 
 
 def _meet(first: np.ndarray, second: np.ndarray) -> bool:
