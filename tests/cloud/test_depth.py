@@ -533,3 +533,23 @@ def test_depths_that_end_at_one_are_told():
     with pytest.warns(CloudWarning, match="22% of the depths are exactly 1"):
         cloud_from_depth(depth, K)
     cloud_from_depth(depth, K, depth_unit=1.0)  # whose user says metres is believed
+
+
+@pytest.mark.parametrize("step", [0.01, 4.0 / 255])
+def test_depths_of_large_steps_are_told(step):
+    """Centimetres as 8-bit grey values, of 4 m for example, lose the edges of things."""
+    rows = np.linspace(0.5, 0.9, 60)[:, None] + np.zeros((60, 80))
+    fine = np.round(rows, 3)
+    coarse = step * np.round(rows / step)
+    camera = (70.0, 70.0, 39.5, 29.5)
+    cloud_from_depth(fine, camera)
+    with pytest.warns(CloudWarning, match=rf"depth: its steps are {1000 * step:.3g} mm"):
+        cloud_from_depth(coarse, camera)
+
+
+@pytest.mark.parametrize("ratio", [0.75, 1.3])
+def test_pixels_that_are_not_square_are_told(ratio):
+    depth = np.full((60, 80), 0.5)
+    with pytest.warns(CloudWarning, match=rf"fx is {ratio:g} times fy, .* resized unevenly"):
+        cloud_from_depth(depth, (ratio * 70.0, 70.0, 39.5, 29.5))
+    cloud_from_depth(depth, (1.02 * 70.0, 70.0, 39.5, 29.5))

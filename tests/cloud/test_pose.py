@@ -335,6 +335,13 @@ def test_an_image_upside_down_is_told_in_the_camera_s_own_frame():
     assert Scene.from_depth(depth.flip(0), HALF, table=hanging).notes == ()
 
 
+def test_a_transposed_image_is_told_in_the_camera_s_own_frame():
+    depth, _ = seen()
+    fx, fy, cx, cy = HALF[0, 0], HALF[1, 1], HALF[0, 2], HALF[1, 2]
+    (note,) = Scene.from_depth(depth.T, (float(fy), float(fx), float(cy), float(cx))).notes
+    assert "on its side" in note and "depth.T" in note
+
+
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("off", [-0.3, -0.02, 0.015, 0.05])
 def test_a_given_table_beside_the_layer_of_the_points_is_told(view, off):

@@ -51,6 +51,14 @@ class DepthNumbers:
     """Least share of pixels with the greatest depth, from which this depth, if too far, marks a
     background.
     """
+    sampled: int = 5000
+    """Number of pixels, about, by which the step of the depths is found."""
+    levels: int = 10
+    """Fewest different depths that show a step: one of few faces has fewer."""
+    even: float = 1e-3
+    """Greatest error of a depth that is a whole number of steps, over the step."""
+    coarse: float = 0.005
+    """Least step [m] of the depths that is told: it is larger than edges of things and noise."""
     several: float = 0.05
     """Least share of a mask's pixels with one number that may be another object."""
     viewed: int = 5000
@@ -252,6 +260,12 @@ def _in_metres(image: Tensor, unit: float | None) -> Image:
             found = f"{share:.0%} of the depths are exactly 1, and none is larger"
             fix = "if it is a z-buffer, or depth scaled to 0..1, give metres"
             warn_user(CloudWarning, f"depth: {found}: {fix}")
+    step = _step_of(measured)
+    if step >= DEPTH.coarse:
+        found = (
+            f"depth: its steps are {1e3 * step:.3g} mm, in which edges and small things are lost"
+        )
+        warn_user(CloudWarning, f"{found}; save more digits, such as 16-bit millimetres")
     near = measured[measured <= DEPTH.farthest]
     # Renderers write one large number, such as 1e10, where they see nothing.
     background = measured == measured.max() if len(near) else measured > math.inf
@@ -272,3 +286,15 @@ def _in_metres(image: Tensor, unit: float | None) -> Image:
         allowed = f"a median depth of at least {DEPTH.nearest:g} metres"
         raise BadArgument("depth", found, allowed)
     return torch.where(metres <= DEPTH.farthest, metres, 0.0)
+
+
+def _step_of(measured: Float[Tensor, "n"]) -> float:
+    """Return the step [m] of which all depths (n,) [m] are whole numbers from the least one on; 0
+    if there is none, or the depths are too few.
+    """
+    some = measured[:: 1 + len(measured) // DEPTH.sampled].unique()
+    if len(some) < DEPTH.levels:
+        return 0.0
+    step = float(some.diff().min())
+    counts = (some - some[0]) / step
+    return step if bool(((counts - counts.round()).abs() < DEPTH.even).all()) else 0.0

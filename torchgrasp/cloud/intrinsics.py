@@ -13,8 +13,9 @@ from torch import Tensor
 
 from torchgrasp.cloud.lens import FIELDS, Lens, numbers_of, read_lens
 from torchgrasp.foundation.checks import check_tensor
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, CloudWarning
 from torchgrasp.foundation.limits import SHOWN_LETTERS
+from torchgrasp.foundation.told import warn_user
 
 Matrix = Float[Tensor, "3 3"]
 OPEN3D = "intrinsic_matrix"
@@ -61,6 +62,10 @@ class IntrinsicsNumbers:
     """Least focal length over the side of the image: a view of 147 degrees, wider than any."""
     unequal: float = 0.05
     """Greatest difference of fx and fy, over fy, of four numbers in their right order."""
+    uneven: float = 0.12
+    """Difference of fx and fy, over fy, that is told: pixels of old cameras differ by less, images
+    that were resized to other proportions by more.
+    """
     beside: float = 0.1
     """Greatest shift of the principal point from the middle in four such numbers. It is a share of
     the side of the image.
@@ -294,8 +299,9 @@ def _is_table(value: object) -> bool:
 def check_intrinsics(k: Matrix, stated: list[float] | None, size: Sequence[int]) -> None:
     """Raise `BadArgument` for intrinsics that no camera has, or that are those of another image.
 
-    `k` is the matrix [pixels]; `stated` is the [width, height] that came with it, or None. The
-    image has the `size` (h, w) [pixels], and may be a crop.
+    Pixels that are not square raise a `CloudWarning`. `k` is the matrix [pixels]; `stated` is the
+    [width, height] that came with it, or None. The image has the `size` (h, w) [pixels], and may be
+    a crop.
     """
     height, width = size
     (fx, _, cx), (_, fy, cy) = k[:2].tolist()
@@ -323,6 +329,13 @@ def check_intrinsics(k: Matrix, stated: list[float] | None, size: Sequence[int])
     if not straight and fits(fx, fy, cy, cx) and shift(cy, cx) <= LIMITS.swapped:
         found = f"a principal point ({cx:.4g}, {cy:.4g}) px in an image of {width} x {height}"
         raise BadArgument("intrinsics", found, "cx of the column before cy of the row")
+    if abs(fx / fy - 1) > LIMITS.uneven:
+        found = (
+            f"intrinsics: fx is {fx / fy:.3g} times fy, as of an image that was resized unevenly"
+        )
+        warn_user(
+            CloudWarning, f"{found}; if it was cropped instead, give one focal length for both"
+        )
 
 
 def _check_size(k: Matrix, stated: list[float] | None, width: int, height: int) -> None:

@@ -82,7 +82,7 @@ class PoseNumbers:
     """Tilt of a table [deg] from which a note tells it."""
     upturned: float = 0.5
     """Part of a table's normal along y of the camera's own frame, which points down. Above this,
-    the camera hangs upside down.
+    the camera hangs upside down. With such a part along x it lies on its side.
     """
     sloped: float = 15.0
     """A table tilted by less than this [deg], or as far from upside down, may be a slope."""
@@ -408,12 +408,18 @@ def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
     `plane` is the table in the frame.
     """
     if _is_own(pose):
-        if float(plane.normal[1]) <= POSE.upturned:
-            return ()
-        return (
-            "the camera hangs upside down, as the table shows. If it does not, the image is "
-            "flipped, and objects are mirrored: give depth[::-1]",
-        )
+        right, down, _ = plane.normal.tolist()
+        if down > POSE.upturned:
+            return (
+                "the camera hangs upside down, as the table shows. If it does not, the image is "
+                "flipped, and objects are mirrored: give depth[::-1]",
+            )
+        if abs(right) > POSE.upturned:
+            return (
+                "the camera lies on its side, as the table shows. If it does not, the image is "
+                "transposed, and objects are mirrored: give depth.T, and cx and cy to match",
+            )
+        return ()
     cosine = float(plane.normal[2])
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
     if tilt < POSE.told:
