@@ -268,3 +268,38 @@ def test_sums_of_joints_come_from_tendons_of_two_motors(tmp_path):
         'sources = { "left_bend" = 0.5, "right_bend" = 0.25 }'
         in (tmp_path / "hand.toml").read_text()
     )
+
+
+def servo(name, more):
+    return f'<position name="{name}" joint="{name}" kp="5" forcerange="-2 2" {more}/>'
+
+
+@pytest.mark.parametrize(
+    ("motor", "ends"),
+    [
+        (servo("left_bend", 'ctrlrange="-0.2 0.9"'), (-0.2, 0.9)),
+        # the servo turns a gear: its control is in turns of the motor
+        (servo("left_bend", 'gear="2" ctrlrange="-0.4 1.0"'), (-0.2, 0.5)),
+        (
+            '<general name="left_bend" joint="left_bend" biastype="affine" gainprm="0.02" '
+            'biasprm="0.3 -3 0" ctrlrange="0 100" forcerange="-2 2"/>',
+            (0.1, 0.3 / 3 + 2 / 3),
+        ),
+        (servo("left_bend", 'ctrlrange="-3 3"'), None),
+        (
+            '<intvelocity name="left_bend" joint="left_bend" kp="5" ctrlrange="-0.1 0.1" '
+            'actrange="-0.1 1.2" forcerange="-2 2"/>',
+            (-0.1, 1.2),
+        ),
+    ],
+)
+def test_joints_are_narrowed_to_what_their_servo_reaches(tmp_path, motor, ends):
+    others = motors([name for name in SEVEN if name != "left_bend"])
+    file = tmp_path / "hand.xml"
+    file.write_text(one(f"<actuator>{others}{motor}</actuator>"))
+    told = write_draft(new_hand(file), tmp_path)
+    hand = load_hand(tmp_path)
+    at = hand.joint_names.index("left_bend")
+    found = float(hand.lower[at]), float(hand.upper[at])
+    assert found == pytest.approx(ends or (-np.pi / 4, np.pi / 2))
+    assert ("joint left_bend is narrowed by the control of left_bend" in told) == (ends is not None)

@@ -15,6 +15,7 @@ from torchgrasp.foundation.errors import BadArgument, HandFileError
 STRAIGHT = 2  # coefficients of a polynomial of degree one
 CURVED = slice(2, 5)  # further coefficients of an equality of joints in MuJoCo
 FIT_POINTS = 101  # positions at which a straight line is fitted to a polynomial
+SAME = 1e-3  # greatest difference of limits that count as one, as a share of the range
 TIP = "tip"  # in the name of a site at a fingertip
 
 
@@ -372,7 +373,7 @@ class ModelHand:
                 continue
             given = [found[index[source]].effort / abs(x) for source, x in mimic.terms]
             found[j] = dataclasses.replace(found[j], effort=min(given))
-        return self._within_tendons(found, mechanism)
+        return self._within_control(self._within_tendons(found, mechanism), mechanism)
 
     def _force(self, actuator: int) -> tuple[float, float]:
         """Return the least and the greatest force of an actuator [N or N m]; zeros if unknown."""
@@ -396,54 +397,108 @@ class ModelHand:
         if bool(model.jnt_limited[joint]):
             low, high = np.asarray(model.jnt_range[joint]).tolist()
             return low, high
-        affine = int(self.mujoco.mjtBias.mjBIAS_AFFINE)
         for k in np.flatnonzero(arms).tolist():
-            alone = np.count_nonzero(self._pull(k)) == 1
-            gain = float(model.actuator_gainprm[k][0])
-            servo = int(model.actuator_biastype[k]) == affine
-            servo = servo and gain > 0 and float(model.actuator_biasprm[k][1]) == -gain
-            if alone and servo and bool(model.actuator_ctrllimited[k]):
-                ends = np.asarray(model.actuator_ctrlrange[k]) / arms[k]
+            ends = self._reach(k)
+            if ends is not None and np.count_nonzero(self._pull(k)) == 1:
+                low, high = sorted(end / float(arms[k]) for end in ends)
                 self.told.append(f"joint {self.joint_names[joint]} is limited by its control")
-                return float(ends.min()), float(ends.max())
+                return low, high
         return -math.inf, math.inf
+
+    def _reach(self, actuator: int) -> tuple[float, float] | None:
+        """Return the ends between which a position servo can hold what it drives [rad or m]; None
+        for other actuators, and for a control without limits.
+        """
+        model = self.model
+        gain = float(model.actuator_gainprm[actuator][0])
+        start, slope = np.asarray(model.actuator_biasprm[actuator][:2], dtype=float).tolist()
+        affine = int(model.actuator_biastype[actuator]) == int(self.mujoco.mjtBias.mjBIAS_AFFINE)
+        fixed = int(model.actuator_gaintype[actuator]) == int(self.mujoco.mjtGain.mjGAIN_FIXED)
+        if not (affine and fixed and gain > 0 and slope < 0):
+            return None
+        ends = model.actuator_ctrlrange[actuator]
+        limited = bool(model.actuator_ctrllimited[actuator])
+        # the control of an integrator is a speed, and its state is the position
+        if int(model.actuator_dyntype[actuator]) == int(self.mujoco.mjtDyn.mjDYN_INTEGRATOR):
+            ends = model.actuator_actrange[actuator]
+            limited = bool(model.actuator_actlimited[actuator])
+        if not limited:
+            return None
+        low, high = ((gain * np.asarray(ends, dtype=float) + start) / -slope).tolist()
+        return low, high
+
+    def _within_control(self, drives: dict[int, Drive], mechanism: Mechanism) -> dict[int, Drive]:
+        """Return the drives, with joints narrowed to where their own servo can hold them."""
+        names = names_of(self.model, "actuator", self.model.nu)
+        for k in range(self.model.nu):
+            ends = self._reach(k)
+            if ends is not None:
+                row = self._pull(k)
+                self._narrow(drives, row, ends, mechanism, f"the control of {names[k]}")
+        return drives
+
+    def _narrow(
+        self,
+        drives: dict[int, Drive],
+        row: np.ndarray,
+        ends: Sequence[float],
+        mechanism: Mechanism,
+        what: str,
+    ) -> None:
+        """Narrow the limits of the joint that alone sets a sum over joints, which lies between two
+        ends.
+
+        `row` holds the factors of all joints in the sum. `what` has these ends in sentences. A sum
+        of several joints that can leave its ends is told.
+        """
+        index = {self.joint_names[j]: j for j in self.joints}
+        every, shift = self._leading_arms(row, mechanism)
+        arms = {name: arm for name, arm in every.items() if arm and name in index}
+        free = [end - shift for end in ends]
+        if len(arms) == 1:
+            ((name, arm),) = arms.items()
+            old = drives[index[name]]
+            low, high = sorted(end / arm for end in free)
+            # a range that is rounded in the file is that of the joint
+            least = SAME * (old.upper - old.lower)
+            low = old.lower if low < old.lower + least else low
+            high = old.upper if high > old.upper - least else high
+            new = dataclasses.replace(old, lower=low, upper=high)
+            if new != old and new.lower < new.upper:
+                drives[index[name]] = new
+                self.told.append(f"joint {name} is narrowed by {what}")
+            return
+        spans = list[tuple[float, float]]()
+        for name, arm in arms.items():
+            drive = drives[index[name]]
+            low, high = sorted((arm * drive.lower, arm * drive.upper))
+            spans.append((low, high))
+        low, high = (sum(span) for span in zip(*spans, strict=True)) if spans else (0.0, 0.0)
+        least = SAME * (high - low)
+        if spans and (low < min(free) - least or high > max(free) + least):
+            self.warnings.append(f"not kept: {what}, on a sum of {', '.join(arms)}")
 
     def _within_tendons(self, drives: dict[int, Drive], mechanism: Mechanism) -> dict[int, Drive]:
         """Return the drives, with joints narrowed by the limits of tendons that one joint sets."""
         model = self.model
         names = names_of(model, "tendon", model.ntendon)
-        index = {self.joint_names[j]: j for j in self.joints}
         for k in range(model.ntendon):
-            if not (bool(model.tendon_limited[k]) and self._is_fixed(k)):
-                continue
-            every, shift = self._leading_arms(k, mechanism)
-            arms = {name: arm for name, arm in every.items() if arm and name in index}
-            ends = (np.asarray(model.tendon_range[k]) - shift).tolist()
-            if len(arms) == 1:
-                ((name, arm),) = arms.items()
-                old = drives[index[name]]
-                low, high = sorted(end / arm for end in ends)
-                new = dataclasses.replace(
-                    old, lower=max(low, old.lower), upper=min(high, old.upper)
-                )
-                if new != old and new.lower < new.upper:
-                    drives[index[name]] = new
-                    self.told.append(f"joint {name} is narrowed by the limits of tendon {names[k]}")
-            elif arms:
-                self.warnings.append(
-                    f"the limits of tendon {names[k]}, a sum of {', '.join(arms)}, are not kept"
-                )
+            if bool(model.tendon_limited[k]) and self._is_fixed(k):
+                ends = np.asarray(model.tendon_range[k]).tolist()
+                what = f"the limits of tendon {names[k]}"
+                self._narrow(drives, self._tendon(k), ends, mechanism, what)
         return drives
 
-    def _leading_arms(self, tendon: int, mechanism: Mechanism) -> tuple[dict[str, float], float]:
-        """Return the arm of a fixed tendon on each leading joint by name. Return also the part of
-        its length that no joint changes.
+    def _leading_arms(
+        self, row: np.ndarray, mechanism: Mechanism
+    ) -> tuple[dict[str, float], float]:
+        """Return the factor of each leading joint by name in a sum over joints with the factors
+        `row`. Return also the part of the sum that no joint changes.
         """
         arms = dict[str, float]()
         shift = 0.0
-        coefficients = self._tendon(tendon)
-        for j in np.flatnonzero(coefficients).tolist():
-            arm = float(coefficients[j])
+        for j in np.flatnonzero(row).tolist():
+            arm = float(row[j])
             name = self.joint_names[j]
             mimic = mechanism.followers.get(name)
             if mimic is not None:
