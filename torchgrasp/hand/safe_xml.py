@@ -153,6 +153,24 @@ def seen_links(data: bytes) -> tuple[str, ...]:
     return tuple(link.get("name", "") for link in _seen_only(robot))
 
 
+def soft_limits(data: bytes) -> dict[str, tuple[float, float]]:
+    """Return the soft limits [rad or m] of joints by name, where a <safety_controller> has both.
+
+    `data` are the bytes of a file that `parse_urdf` took.
+    """
+    robot = ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
+    found = {}
+    for joint in robot.findall("joint"):
+        safety = joint.find("safety_controller")
+        if safety is None:
+            continue
+        texts = [safety.get(f"soft_{end}_limit", "") for end in ("lower", "upper")]
+        if all(NUMBER.fullmatch(text) for text in texts):
+            low, high = map(float, texts)
+            found[joint.get("name", "")] = (low, high)
+    return found
+
+
 def _seen_only(robot: ET.Element) -> list[ET.Element]:
     """Return the links of a robot with a <visual> but no <collision>."""
     links = robot.findall("link")

@@ -212,6 +212,26 @@ def test_numbers_that_no_hand_has_are_named(claw, old, new, words):
     assert any(re.search(words, x) for x in told)
 
 
+def test_soft_limits_within_the_limits_are_told(claw):
+    """A safety controller stops the joint there; equal, empty and half ones say nothing."""
+    urdf = read_published(claw)
+    bend = next(j for j in urdf.movable if j.name == "left_bend")
+    text = claw.read_text()
+    for found, told in (
+        (f'soft_lower_limit="{bend.lower}" soft_upper_limit="{bend.upper - 0.2}"', True),
+        (f'soft_lower_limit="{bend.lower}" soft_upper_limit="{bend.upper}"', False),
+        ('soft_lower_limit="0" soft_upper_limit="0"', False),
+        ('soft_lower_limit="0.1"', False),
+        ('k_velocity="3"', False),
+    ):
+        start = text.index('<joint name="left_bend"')
+        place = text.index("<parent", start)
+        claw.write_text(f"{text[:place]}<safety_controller {found}/>{text[place:]}")
+        urdf = read_published(claw)
+        words = find_unusual(urdf, shape_points(urdf, claw.parent))
+        assert any("soft limits" in x and "left_bend" in x for x in words) == told
+
+
 def test_a_frame_of_a_nanogram_is_merged_as_one_without_mass(claw, tmp_path):
     """Exporters give frames a mass of 1e-9 kg, with which no simulator can reckon."""
     inertial = f'<inertial><mass value="1e-9"/>{INERTIA.format(0)}</inertial>'

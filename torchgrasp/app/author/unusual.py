@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from torchgrasp.hand.safe_xml import soft_limits
 from torchgrasp.hand.urdf import Urdf
 
 Bounds = tuple[float, float]  # the least and the greatest usual value
@@ -46,7 +47,7 @@ def find_unusual(urdf: Urdf, points: Mapping[str, Sequence[np.ndarray]]) -> list
     """Return a sentence for each kind of number of a URDF that no hand has.
 
     `points` (n, 3) [m] are those on every shape of each link, by its name, in its frame. Numbers
-    that the URDF lacks are not named.
+    that the URDF lacks are not named. Another sentence names soft limits, which are not read.
     """
     sizes = []
     dense = []
@@ -87,7 +88,26 @@ def find_unusual(urdf: Urdf, points: Mapping[str, Sequence[np.ndarray]]) -> list
         for what, *rest in zip(("range", "effort", "velocity"), units, bounds, values, strict=True):
             named.append((f"the {what} of {kind}", *rest))
     found = [_outside(*kind) for kind in named]
+    found.append(_soft_limits(urdf))
     return [sentence for sentence in found if sentence]
+
+
+def _soft_limits(urdf: Urdf) -> str:
+    """Return a sentence on the joints whose soft limits are narrower than their limits; "" if there
+    is none.
+
+    A robot's safety controller stops such a joint before a planned posture.
+    """
+    soft = soft_limits(urdf.data)
+    narrow = []
+    for j in urdf.movable:
+        low, high = soft.get(j.name, (j.lower, j.upper))
+        if low < high and (low > j.lower or high < j.upper):
+            narrow.append(f"{j.name} {low:.3g} to {high:.3g} of {j.lower:.3g} to {j.upper:.3g}")
+    if not narrow:
+        return ""
+    told = "soft limits (<safety_controller>) are not kept: narrow the <limit> if your robot keeps them"
+    return f"{told}: {', '.join(narrow)}"
 
 
 def _outside(what: str, unit: str, bounds: Bounds, values: Iterable[tuple[str, float]]) -> str:
