@@ -269,6 +269,19 @@ def test_malformed_compressed_data_are_refused_by_name(tmp_path, points, body):
         read_cloud(tmp_path / "a.pcd")
 
 
+@pytest.mark.parametrize(
+    "line", ["comment units millimetres", "comment scale 0.1", "obj_info offset: 432100 5412300 0"]
+)
+def test_a_unit_or_a_scale_in_a_header_is_told(tmp_path, points, line):
+    save_cloud(PointCloud(torch.from_numpy(points)), tmp_path / "a.ply")
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(data.replace(b"ply\n", f"ply\n{line}\n".encode(), 1))
+    file = read_cloud_file(tmp_path / "a.ply")
+    (note,) = file.notes
+    assert line in note and "--unit" in note
+    torch.testing.assert_close(file.cloud.points, torch.from_numpy(points).double(), atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize("colour", [(1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0.58, 0.58, 0.58)])
 def test_colours_of_length_1_are_no_normals(tmp_path, colour):
     """The surface tells them from normals, which are across it, of either sign and with noise."""

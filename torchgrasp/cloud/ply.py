@@ -27,6 +27,8 @@ TYPES = {
 """NumPy's types by the old and new names of the PLY format."""
 SHAPES = {"viewpoint": (3,), "frustum": (4, 3), "table": (4,)}
 """Shapes of the arrays in comments."""
+MEANT = ("scale", "scaling", "offset", "shift", "unit", "units")
+"""First words of comments that may change what the coordinates mean; no standard has them."""
 SAMPLED = 2000  # points on the surface of a mesh
 ROUNDING = 1e-5  # greatest rounding [m] of coordinates that are written in float32
 Property = tuple[str, str, str]  # name, type, and type of the length if it is a list
@@ -36,12 +38,14 @@ def parse_ply(data: bytes) -> dict[str, Any]:
     """Return the arrays of a PLY file by name, in the file's unit.
 
     They are "points" and "normals" (n, 3), "viewpoint" (3,), "frustum" (4, 3) and "table" (4,),
-    where the file has them. A mesh gives points on its surface. Raises `Malformed` for a malformed
+    where the file has them. "said" lists comments on a unit or a scale, which are not applied. A
+    mesh gives points on its surface. Raises `Malformed` for a malformed
     file.
     """
     header, body = _split_header(data)
     encoding = ""
-    known = dict[str, np.ndarray]()
+    known = dict[str, Any]()
+    said = list[str]()
     elements: list[tuple[str, int, list[Property]]] = []
     for line in header:
         match line.split():
@@ -51,6 +55,8 @@ def parse_ply(data: bytes) -> dict[str, Any]:
                 SHAPES[name]
             ):
                 known[name] = np.array([float(x) for x in numbers]).reshape(SHAPES[name])
+            case ["comment" | "obj_info", word, _, *_] if word.lower().rstrip(":=") in MEANT:
+                said.append(line)
             case ["element", name, count]:
                 elements.append((name, int(count), []))
             case ["property", "list", length, kind, name] if (
@@ -63,6 +69,7 @@ def parse_ply(data: bytes) -> dict[str, Any]:
                 raise Malformed(f"the header line {line!r}")
     if encoding not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise Malformed(f"the encoding {encoding!r}")
+    known["said"] = said
     # Before the body is parsed: a mesh has twice as many faces as corners.
     if any(not 0 <= count <= 2 * CLOUD_POINTS for _, count, _ in elements):
         counts = [(name, count) for name, count, _ in elements]
@@ -73,7 +80,12 @@ def parse_ply(data: bytes) -> dict[str, Any]:
             found = f"a mesh of {len(body)} bytes of text"
             raise Malformed(f"{found}, which may have {TEXT_MESH_BYTES}")
         points, normals = _sample_mesh(data)
-        return {"points": points, "normals": normals, "viewpoint": known.get("viewpoint")}
+        return {
+            "points": points,
+            "normals": normals,
+            "viewpoint": known.get("viewpoint"),
+            "said": said,
+        }
     if not elements or elements[0][0] != "vertex":
         raise Malformed("a first element that is not called vertex")
     _, count, properties = elements[0]

@@ -42,6 +42,8 @@ class ReadNumbers:
 
     shown: int = 200
     """Most letters of the names of columns in a note."""
+    lines: int = 3
+    """Most lines of a header in notes."""
     unit: float = 1e-4
     """Greatest error of the unit length of a table's normal."""
     near_unit: float = 0.05
@@ -292,6 +294,9 @@ def make_cloud(
         notes.append(f"columns {', '.join(arrays['other'])[: READ.shown]} were left out")
     if arrays.get("unread"):
         notes.append(f"arrays {', '.join(arrays['unread'])[: READ.shown]} were not read")
+    for line in arrays.get("said", ())[: READ.lines]:
+        told = f"the header's line {line[: READ.shown]!r} is not applied"
+        notes.append(f"{told}: --unit says the unit, and options are in metres")
     points = scale * _as_rows(source, "points", arrays["points"])
     normals = arrays.get("normals")
     normals = None if normals is None else _as_rows(source, "normals", normals)
