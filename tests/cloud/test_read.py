@@ -279,7 +279,9 @@ def test_a_unit_or_a_scale_in_a_header_is_told(tmp_path, points, line):
     file = read_cloud_file(tmp_path / "a.ply")
     (note,) = file.notes
     assert line in note and "--unit" in note
-    torch.testing.assert_close(file.cloud.points, torch.from_numpy(points).double(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        file.cloud.points, torch.from_numpy(points).double(), atol=1e-6, rtol=0
+    )
 
 
 @pytest.mark.parametrize("colour", [(1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0.58, 0.58, 0.58)])

@@ -136,6 +136,10 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
                 most = f"shapes that reach at most {MAX_EXTENT:g} m"
                 wanted = f"{most}; a mesh in millimetres needs a scale of 0.001"
                 raise urdf.wrong(f"{called} {reach:.3g} m", wanted)
+            if is_mesh and 0 in shape.size:
+                scale = " ".join(f"{x:g}" for x in shape.size)
+                found = f"mesh {shape.file!r} with the scale {scale}"
+                raise urdf.wrong(found, "a scale that is not 0 on any axis")
             if is_mesh and reach < FIT.least_reach:
                 wanted = "metres: scaled twice, or by 0?"
                 raise urdf.wrong(f"{called} {1e3 * reach:.3g} mm", wanted)
