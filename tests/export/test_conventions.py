@@ -210,6 +210,25 @@ def test_degrees_and_another_zero_are_converted(tmp_path):
             read_foreign(tmp_path / "a.npz", hand, [wrong, *order[1:]])
 
 
+@pytest.mark.parametrize("name", ["allegro", "leap"])
+def test_the_names_of_joints_in_a_file_are_its_order(tmp_path, name):
+    """DexGraspBench reorders postures by `joint_names`: they hold before any usual order."""
+    hand = load_hand(name)
+    every = hand.expand_joints(middle(hand))[0].numpy()
+    place = np.array([0.1, 0.0, 0.2]), Rotation.identity()
+    names = np.array(hand.tree.joint_names)
+    turned = np.random.default_rng(0).permutation(len(names))
+    file = tmp_path / "a.npz"
+    np.savez(file, grasp_qpos=row(place, every[turned]), joint_names=names[turned])
+    torch.testing.assert_close(read_foreign(file, hand).joints, middle(hand))
+    # a given order holds before that of the file
+    np.savez(file, grasp_qpos=row(place, every), joint_names=names[turned])
+    torch.testing.assert_close(read_foreign(file, hand, names.tolist()).joints, middle(hand))
+    np.savez(file, grasp_qpos=row(place, every), joint_names=[f"rh_{x}" for x in names])
+    with pytest.raises(ModelFileError, match=r"in this order: .* --joints, got .*joint_names rh_"):
+        read_foreign(file, hand)
+
+
 def test_values_that_are_not_kept_are_told(tmp_path):
     hand = load_hand("allegro")
     every = hand.expand_joints(middle(hand))[0].numpy()

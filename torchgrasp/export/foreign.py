@@ -73,7 +73,11 @@ GRIPPER_KNOWN = ("object_ID", "test_type", "controller", "test_duration", "physi
 GRIPPER_TIMES = ("result_time", "runtime", "timestamp")  # known, too
 # arrays of a DexGraspBench file: read, and those that we know and need not
 BENCH_READ = ("grasp_qpos", "pregrasp_qpos", "obj_pose")
-BENCH_KNOWN = ("obj_path", "obj_scale", "squeeze_qpos")
+BENCH_KNOWN = ("obj_path", "obj_scale", "squeeze_qpos", "joint_names")
+BENCH_FILE = "an .npz of at most 512 MiB with 'grasp_qpos'"
+MOST_JOINTS = 100  # most names of joints that are read
+MOST_SHOWN = 200  # letters of these names in an error
+BENCH_NAMES = "joint_names"  # array with the names of the joints in the order of a posture
 _refuse = functools.partial(ModelFileError, "path")  # the error of a bad file of grasps
 Quaternion = Literal["wxyz", "xyzw"]
 
@@ -138,7 +142,7 @@ def read_foreign(
             `JOINT:FACTOR` or `JOINT:FACTOR:OFFSET` converts a number of another sign, unit or zero
             position: the joint is at FACTOR x number + OFFSET [rad, or m for a sliding joint].
             Numbers under names that the hand does not have are not read. () is for files that name
-            their joints, and for the Allegro hand's files of DexGraspBench.
+            their joints, as by `joint_names`, and for the Allegro hand's files of DexGraspBench.
         quaternion: order of the four numbers after the position in a pose, "wxyz" or "xyzw". Files
             that name their numbers need none.
         unit_m: length [m] of one unit of the positions in the file.
@@ -331,11 +335,13 @@ def _read_bench(
     several.
     """
     bench_from_root, known = bench_frame(hand)
+    data = _bench_bytes(path)
+    order = order or _bench_joints(path, data, hand)
     # the signs of a hand whose frame is known are known, too
     columns = read_order(hand, order) if order else tuple(Column(x, turned=True) for x in known)
     if not columns:
         columns = read_order(hand, ())
-    rows = _bench_tables(path, POSE_NUMBERS + len(columns))
+    rows = _bench_tables(path, data, POSE_NUMBERS + len(columns))
     poses = dict[str, Tensor]()
     joints = dict[str, Tensor]()
     for name, table in rows.items():
@@ -360,18 +366,45 @@ def _read_bench(
     return ForeignGrasps(joints["grasp_qpos"], placed["grasp_qpos"], opened)
 
 
-def _bench_tables(path: Path, width: int) -> dict[str, np.ndarray]:
-    """Return the tables (g, `width`) of grasps in an .npz file of DexGraspBench, and its `obj_pose`
-    (1 or g, 7), by name.
+def _bench_bytes(path: Path) -> bytes:
+    """Return the bytes of an .npz file of DexGraspBench; raise `ModelFileError` for a missing or
+    large one.
+    """
+    if not is_file(path) or path.stat().st_size > CLOUD_BYTES:
+        raise _refuse(f"{path}: no file, or a larger one", BENCH_FILE)
+    return read_bytes(path)
+
+
+def _bench_joints(path: Path, data: bytes, hand: Hand) -> tuple[str, ...]:
+    """Return the names of the joints in the order of the file's postures, () if it has none.
+
+    Raises `ModelFileError` for names that are not those of the hand, as their order is then
+    unknown.
     """
     try:
-        if not is_file(path) or path.stat().st_size > CLOUD_BYTES:
-            raise ValueError("no file, or a larger one")
-        data = read_bytes(path)
+        names = parse_npz(data, (BENCH_NAMES,)).get(BENCH_NAMES)
+    except Exception as error:  # zlib, zipfile and NumPy each raise their own
+        raise _refuse(f"{path}: {error}", BENCH_FILE) from error
+    if names is None:
+        return ()
+    found = tuple(str(name) for name in names.ravel()[:MOST_JOINTS])
+    if names.dtype.kind != "U" or not {*hand.joint_names} <= {*found}:
+        shown = f"{path}: {BENCH_NAMES} {' '.join(found)[:MOST_SHOWN]}"
+        raise _refuse(shown, "the joints of our hand in this order: give them with --joints")
+    return found
+
+
+def _bench_tables(path: Path, data: bytes, width: int) -> dict[str, np.ndarray]:
+    """Return the tables (g, `width`) of grasps in an .npz file of DexGraspBench, and its `obj_pose`
+    (1 or g, 7), by name.
+
+    `data` are the bytes of the file.
+    """
+    try:
         tables = parse_npz(data, BENCH_READ, "grasp_qpos")
         others = unread_arrays(data, (*BENCH_READ, *BENCH_KNOWN))
     except Exception as error:  # zlib, zipfile and NumPy each raise their own
-        raise _refuse(f"{path}: {error}", "an .npz of at most 512 MiB with 'grasp_qpos'") from error
+        raise _refuse(f"{path}: {error}", BENCH_FILE) from error
     if others:
         warn_user(GraspFileWarning, f"{path.name}: not read: {', '.join(others)}")
     for name, table in tables.items():

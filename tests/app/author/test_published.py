@@ -368,7 +368,7 @@ def test_a_mesh_that_is_broken_or_elsewhere_is_refused_by_name(claw, name):
 def test_a_mesh_that_is_scaled_flat_is_refused(claw):
     trimesh.creation.box((0.02, 0.02, 0.02)).export(claw.parent / "tip.stl")
     change(claw, ('<sphere radius="0.011"/>', '<mesh filename="tip.stl" scale="1 1 0"/>'))
-    with pytest.raises(HandFileError, match="not 0 on any axis, got .* the scale 1 1 0"):
+    with pytest.raises(HandFileError, match=r"not 0 on any axis, got .* the scale 1 1 0"):
         new_hand(claw)
 
 
