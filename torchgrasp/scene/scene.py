@@ -35,6 +35,7 @@ from torchgrasp.scene.image import (
     read_image,
     tell_rays,
 )
+from torchgrasp.scene.leaning import tell_leaning
 from torchgrasp.scene.masks import label_image, read_labels, read_mask
 from torchgrasp.scene.merge import find_touching
 from torchgrasp.scene.segment import find_components
@@ -219,6 +220,12 @@ class Scene(Value):
             notes += (LOCAL, *tell_rays(image))
         if table is None and up is None:
             notes += tell_tilt(image.obj_from_camera, supports[0].plane)
+        notes += tell_leaning(
+            points[measured],
+            found[measured],
+            image.obj_from_camera,
+            supports[0].plane,
+        )
         pixels = torch.nonzero(measured)
         planes = tuple(support.plane for support in supports)
         scene = cls(
