@@ -365,8 +365,9 @@ def test_a_tilt_by_a_wrong_focal_length_is_told():
     depth, pose = seen()
     wrong = HALF * torch.tensor([[1.4], [1.4], [1.0]]).double()
     wrong[:2, 2] = HALF[:2, 2]
-    (note,) = Scene.from_depth(depth, wrong, pose).notes
-    assert "focal length" in note and "tilted by" in note
+    tilted, leaning = Scene.from_depth(depth, wrong, pose).notes
+    assert "focal length" in tilted and "tilted by" in tilted
+    assert "lean towards" in leaning and "1.4 times" in leaning
 
 
 def test_counts_that_are_too_small_are_told():
