@@ -169,7 +169,7 @@ def test_coordinates_of_large_steps_are_told():
     for cloud in (PointCloud(rounded(points, 2)), PointCloud((points + 70_000.0).float())):
         assert any("coordinates in steps of" in str(x) for x in diagnose_cloud(cloud).advice)
         with pytest.warns(CloudWarning, match=r"points: coordinates in steps of \d+"):
-            warn_of_step(cloud)
+            warn_of_step(cloud.points)
 
 
 def test_a_ply_far_from_the_origin_keeps_its_digits(tmp_path):

@@ -199,9 +199,9 @@ def describe_step(step: float) -> str:
     return f"coordinates in steps of {1e3 * step:.2g} mm, of few digits or far from the origin"
 
 
-def warn_of_step(cloud: PointCloud) -> None:
-    """Warn of a cloud whose coordinates are rounded to a large step."""
-    step = coordinate_step(cloud.points)
+def warn_of_step(points: Points) -> None:
+    """Warn of points (n, 3) [m] whose coordinates are rounded to a large step."""
+    step = coordinate_step(points)
     if step > 0:
         fix = "give more digits, or subtract an offset in float64 before float32 is written"
         warn_user(CloudWarning, f"points: {describe_step(step)}; {fix}")

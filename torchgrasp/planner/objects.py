@@ -120,7 +120,7 @@ class ShapedObject:
                 spec, table=scene.table if spec.table is None else spec.table
             )
         cloud = remove_duplicates(cloud)
-        warn_of_step(cloud)
+        warn_of_step(cloud.points)
         frame = upright_frame(cloud.points, cloud.viewpoint, spec.plane)
         # shaped: the Gaussian process, its surface and the distances from the surface
         shape = request.shape

@@ -154,7 +154,7 @@ def fit_shape(
         )
     plane = as_plane(table)
     cloud = remove_duplicates(cloud)
-    warn_of_step(cloud)
+    warn_of_step(cloud.points)
     frame = upright_frame(cloud.points, cloud.viewpoint, plane)
     options = FitOptions(noise, budget, psi_scale, support, kernel, criterion)
     return fit_upright(
