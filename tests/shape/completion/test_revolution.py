@@ -3,6 +3,7 @@ the body hides it.
 """
 
 import math
+import statistics
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from tests.make import real
 from torchgrasp import PointCloud
-from torchgrasp.shape.completion.axis import find_revolution
+from torchgrasp.shape.completion.axis import ROUND, _typical_radius, find_revolution
 from torchgrasp.shape.completion.complete import complete_cloud
 
 CAMERA = real([0.45, 0.0, 0.3])
@@ -69,6 +70,20 @@ def test_boxes_and_walls_are_no_bodies_of_revolution():
     assert (
         find_revolution(0.08 * face, torch.tensor([0.0, 0.0, 1.0]).double().expand(400, 3)) is None
     )
+
+
+def test_the_typical_radius_is_the_median_near_a_height():
+    """Also where no normal near a height meets the axis, or none at all."""
+    generator = torch.Generator().manual_seed(4)
+    height, radius = 0.1 * torch.rand(2, 200, dtype=torch.float64, generator=generator)
+    radius = (radius * 200).round() / 200  # some are equal
+    none = torch.zeros(200, dtype=torch.bool)
+    for meets in (height < 0.06, none):
+        typical = _typical_radius(height, radius, meets).tolist()
+        for own, found in zip(height, typical, strict=True):
+            near = meets & ((height - own).abs() < ROUND.near)
+            wanted = statistics.median_low(radius[near].tolist()) if near.any() else math.nan
+            assert found == pytest.approx(wanted, rel=0, abs=0, nan_ok=True)
 
 
 @pytest.mark.parametrize("azimuth", [1.1, 1.5, -1.9])

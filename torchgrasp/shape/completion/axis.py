@@ -11,10 +11,12 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import (
     Points,
@@ -217,8 +219,10 @@ def _round_body(
     miss = lines.offset - lines.across @ center
     radius = norm(points[:, :2] - center)
     meets = lines.steep & (miss.abs() / radius.clamp_min(ROUND.least_radius) < ROUND.miss)
-    slices = ((points[:, 2:] - points[:, 2]).abs() < ROUND.near) & meets  # (n, n)
-    typical = torch.where(slices, radius, torch.nan).nanmedian(1).values
+    # no other point can be on the body
+    if not (meets | ~lines.steep).double().mean() > ROUND.body_share:
+        return None
+    typical = _typical_radius(points[:, 2], radius, meets)
     # a wall has the typical radius; a flat end may lie anywhere within it
     wall = meets & ((radius - typical).abs() < ROUND.near)
     mask = torch.where(lines.steep, wall, radius < typical + ROUND.near)
@@ -227,6 +231,27 @@ def _round_body(
     one_way = norm(lines.level[side].mean(0))
     enough = mask.double().mean() > ROUND.body_share
     return mask if bool(enough & (spread < 1.0) & (one_way < ROUND.one_way)) else None
+
+
+def _typical_radius(
+    height: Float[Tensor, "n"],
+    radius: Float[Tensor, "n"],
+    meets: Bool[Tensor, "n"],
+) -> Float[Tensor, "n"]:
+    """Return for each point the lower median radius [m] of the points near its height [m] whose
+    normals meet the axis. It is NaN where there are none.
+    """
+    order = flatnonzero(meets)
+    order = order[torch.argsort(radius[order])]
+    slices = (height[:, None] - height[order]).abs() < ROUND.near  # (n, m), by radius
+    count = slices.sum(1)
+    # places of all members of all slices, one slice after the other; torch takes twice as long
+    members = torch.from_numpy(np.flatnonzero(slices.numpy()))
+    middle = count.cumsum(0) - count + (count - 1) // 2
+    some = count > 0
+    typical = torch.full_like(radius, torch.nan)
+    typical[some] = radius[order[members[middle[some]] % len(order)]]
+    return typical
 
 
 def _fit_axis(
