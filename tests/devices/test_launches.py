@@ -19,7 +19,7 @@ KNOWN = {
     "outside": "",
     "cloud/agreement.py": "noise_of check_foot warn_of_low_table",
     "cloud/check.py": "_check _check_distinct _distinct_rows first_of_each",
-    "cloud/neighbours.py": "_fit_block _principal_axes is_flat nearest",
+    "cloud/neighbours.py": "_fit_block _principal_axes clean is_flat nearest",
     "cloud/prepare.py": "_fit_normals prepare_cloud share_facing",
     "cloud/viewpoint.py": "share_unseen",
     "geometry/frames.py": "virtual_frame",

@@ -4,6 +4,7 @@ each point.
 
 import dataclasses
 import math
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -82,22 +83,77 @@ def find_inliers(points: Points, rows: Int[Tensor, "m"] | None = None) -> Bool[T
     return spacing <= NEAR.outlier * spacing.median()
 
 
-def is_flat(points: Points) -> bool:
-    """Return whether a cloud (n, 3) is no thicker than its noise.
+@dataclasses.dataclass(frozen=True)
+class Neighbours:
+    """What the neighbours of a cloud's points tell, each found once and then kept.
+
+    Lengths have the unit of the n points.
+    """
+
+    points: Points
+
+    @cached_property
+    def inliers(self) -> Bool[Tensor, "n"]:
+        """A mask of the points that are not outliers, as `remove_outliers` defines them."""
+        return find_inliers(self.points)
+
+    @cached_property
+    def clean(self) -> "Neighbours":
+        """The neighbours among the m inliers alone."""
+        return Neighbours(self.points[self.inliers])
+
+    @cached_property
+    def near(self) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
+        """Distances and indices of the neighbours to which planes and quadrics are fitted."""
+        return nearest(self.points, NEAR.quadric)
+
+    @cached_property
+    def planes(self) -> tuple[Points, Float[Tensor, "n 3 3"]]:
+        """Variances and principal axes of these neighbours, as `_principal_axes` returns them."""
+        distance, index = self.near
+        return _principal_axes(self.points[index], _weigh(distance))
+
+    @cached_property
+    def quadrics(self) -> tuple[Points, Points, Float[Tensor, "n"]]:
+        """A quadric around each of n points: the moved point, the unit normal and the error.
+
+        The point (n, 3) is moved onto the quadric. The normal (n, 3), of either sign, is that of
+        the quadric there. The rms error has the unit of `points`. Planes would move the points of a
+        ball of radius r inward by s^2 / 2r. Here s is the spread of the neighbours.
+        """
+        distance, index = self.near
+        if len(self.points) <= NEAR.block:
+            weight = _weigh(distance)
+            return _fit_block(self.points, self.points[index], weight, self.planes[1])
+        blocks = zip(*(x.split(NEAR.block) for x in (self.points, *self.near)), strict=True)
+        fits = list[tuple[Points, Points, Tensor]]()
+        for at, distance, rows in blocks:
+            near = self.points[rows]
+            weight = _weigh(distance)
+            fits.append(_fit_block(at, near, weight, _principal_axes(near, weight)[1]))
+        feet, normals, rms = map(torch.cat, zip(*fits, strict=True))
+        return feet, normals, rms
+
+
+def is_flat(points: Points | Neighbours) -> bool:
+    """Return whether a cloud (n, 3) is no thicker than its noise. The cloud may be given with its
+    neighbours.
 
     The noise is twice the error of quadrics around the points.
     """
-    points = points[draw_rows(len(points), NEAR.flat).to(points.device)].double()
-    points = points[find_inliers(points)]
+    every = points if isinstance(points, Neighbours) else Neighbours(points.double())
+    if len(every.points) > NEAR.flat:
+        rows = draw_rows(len(every.points), NEAR.flat)
+        every = Neighbours(every.points[rows.to(every.points.device)])
+    points = every.clean.points
     spread = torch.linalg.svdvals(points - points.mean(0)) / math.sqrt(len(points))
     thickness, _, length = spread.sort().values.tolist()
     # a quadric errs by no more than a plane, which is found sooner
-    distance, index = nearest(points, NEAR.quadric)
-    mean_squares, _ = _principal_axes(points[index], _weigh(distance))
+    mean_squares, _ = every.clean.planes
     most = 2 * float(mean_squares[:, 0].clamp_min(0).sqrt().median())
     if thickness >= max(most, NEAR.thin * length):
         return False
-    return thickness < max(2 * float(fit_quadrics(points)[2].median()), NEAR.thin * length)
+    return thickness < max(2 * float(every.clean.quadrics[2].median()), NEAR.thin * length)
 
 
 def fit_local_planes(
@@ -113,27 +169,15 @@ def fit_local_planes(
     return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
 
 
-def fit_quadrics(points: Points) -> tuple[Points, Points, Float[Tensor, "n"]]:
-    """Fit a quadric around each of n points; return the moved point, the unit normal and the error.
-
-    The point (n, 3) is moved onto the quadric. The normal (n, 3), of either sign, is that of the
-    quadric there. The rms error has the unit of `points`. Planes would move the points of a ball of
-    radius r inward by s^2 / 2r. Here s is the spread of the neighbours.
-    """
-    whole = (points, *nearest(points, NEAR.quadric))
-    blocks = zip(*(x.split(NEAR.block) for x in whole), strict=True)
-    fits = [_fit_block(at, points[rows], _weigh(distance)) for at, distance, rows in blocks]
-    feet, normals, rms = map(torch.cat, zip(*fits, strict=True))
-    return feet, normals, rms
-
-
 def _fit_block(
-    points: Float[Tensor, "m 3"], near: Float[Tensor, "m k 3"], weight: Float[Tensor, "m k"]
+    points: Float[Tensor, "m 3"],
+    near: Float[Tensor, "m k 3"],
+    weight: Float[Tensor, "m k"],
+    axes: Float[Tensor, "m 3 3"],
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-    """Return the results of `fit_quadrics` for some points, given each point's neighbours and their
-    weights.
+    """Return the quadrics of `Neighbours` around some points, given each point's neighbours, their
+    weights and their principal axes.
     """
-    _, axes = _principal_axes(near, weight)
     height, u, v = ((near - points[:, None]) @ axes).unbind(-1)  # (m, k) each
     size = norm(torch.stack([u, v], -1)).amax(-1, keepdim=True)
     u = u / size

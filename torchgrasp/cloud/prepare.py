@@ -12,10 +12,9 @@ from torch import Tensor
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.cloud.neighbours import (
     NEAR,
+    Neighbours,
     draw_rows,
-    find_inliers,
     fit_local_planes,
-    fit_quadrics,
     nearest,
 )
 from torchgrasp.cloud.pixels import find_pixel_camera
@@ -133,7 +132,11 @@ class PreparedCloud(Value):
 
 @checked
 def prepare_cloud(
-    cloud: PointCloud, generator: torch.Generator, clean: bool = True, up: Vector | None = None
+    cloud: PointCloud,
+    generator: torch.Generator,
+    clean: bool = True,
+    up: Vector | None = None,
+    neighbours: Neighbours | None = None,
 ) -> PreparedCloud:
     """Return the checked cloud, and the points and outward unit normals to which a shape is fitted.
 
@@ -144,11 +147,15 @@ def prepare_cloud(
     If these are the normals of one side, `NoEffect` warns of it. Vectors across the surface, which
     are no normals, raise a `CloudWarning`. With `clean`, a missing viewpoint
     is that of `find_pixel_camera`, if its pixels show it. `up` is the upward direction, or None.
-    Else, and where normals are fitted, it is estimated by `guess_viewpoint`. Raises the errors of
-    `check_cloud`. Raises `BadArgument` for more than 16 cameras or normals that point away from the
-    camera. Raises `TooFewPoints` for a view of fewer than 10 points.
+    Else, and where normals are fitted, it is estimated by `guess_viewpoint`. `neighbours` are those
+    of the points in float64, if they are known. Raises the errors of `check_cloud`. Raises
+    `BadArgument` for more than 16 cameras or normals that point away from the camera. Raises
+    `TooFewPoints` for a view of fewer than 10 points.
     """
-    cloud = remove_duplicates(cloud)
+    distinct = remove_duplicates(cloud)
+    if neighbours is None or len(distinct) < len(cloud):
+        neighbours = Neighbours(distinct.points.double())
+    cloud = distinct
     normals = cloud.normals
     viewpoint = cloud.viewpoint
     if viewpoint is not None and viewpoint.ndim == 2:
@@ -180,7 +187,7 @@ def prepare_cloud(
         viewpoint = _seen_by_pixels(cloud.points, normals, up)
     cloud = dataclasses.replace(cloud, normals=normals, viewpoint=viewpoint)
     if clean or normals is None:
-        cloud = _fit_normals(cloud, clean, up)
+        cloud = _fit_normals(cloud, neighbours, clean, up)
 
     precise = cloud.to(torch.float64)
     points = precise.points
@@ -231,7 +238,8 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
     >>> estimate_normals(cloud).normals.shape
     torch.Size([90, 3])
     """
-    return _fit_normals(remove_duplicates(cloud), clean=False)
+    cloud = remove_duplicates(cloud)
+    return _fit_normals(cloud, Neighbours(cloud.points.double()), clean=False)
 
 
 @checked
@@ -240,17 +248,21 @@ def clean_cloud(cloud: PointCloud) -> PointCloud:
 
     Its normals are outward unit normals of the quadrics. Raises the errors of `check_cloud`.
     """
-    return _fit_normals(remove_duplicates(cloud), clean=True)
+    cloud = remove_duplicates(cloud)
+    return _fit_normals(cloud, Neighbours(cloud.points.double()), clean=True)
 
 
-def _fit_normals(cloud: PointCloud, clean: bool, up: Vector | None = None) -> PointCloud:
+def _fit_normals(
+    cloud: PointCloud, neighbours: Neighbours, clean: bool, up: Vector | None = None
+) -> PointCloud:
     """Return distinct points with fitted outward normals; if `clean`, without outliers and moved
-    onto the fit.
+    onto the fit. The `neighbours` are those of the points in float64.
     """
     if clean:
-        cloud = cloud.select(find_inliers(cloud.points.double()))
+        cloud = cloud.select(neighbours.inliers)
+        neighbours = neighbours.clean
     points = cloud.points
-    feet, normals, rms = fit_quadrics(points.double())
+    feet, normals, rms = neighbours.quadrics
     if clean:
         offset = norm(points.double() - feet)
         keep = offset <= PREPARE.moved * rms.median() + PREPARE.least

@@ -9,7 +9,7 @@ import torch
 from torchgrasp.cloud.advice import check_camera
 from torchgrasp.cloud.agreement import check_foot, warn_of_low_table
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates, warn_of_step
-from torchgrasp.cloud.neighbours import is_flat, nearest
+from torchgrasp.cloud.neighbours import Neighbours, is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, clean_cloud, prepare_cloud
 from torchgrasp.cloud.surroundings import find_surroundings
@@ -198,10 +198,11 @@ def fit_upright(
         check_foot(cloud, Plane.horizontal(table))
         if not in_image:  # in a scene, others may hide the foot
             warn_of_low_table(cloud, Plane.horizontal(table))
+    neighbours = Neighbours(cloud.points.double())
     if len(cloud) < FEW_POINTS:
         few = f"{len(cloud)} points, where a shape needs {FEW_POINTS}"
         warn_user(FewPoints, f"{few}: the shape is a guess; give more points")
-    elif is_flat(cloud.points):
+    elif is_flat(neighbours):
         warn_user(
             Flat,
             "the points lie in one plane, to their noise: the thickness is a guess; "
@@ -210,7 +211,7 @@ def fit_upright(
     generator = torch.Generator("cpu").manual_seed(seed)
     noise = options.noise
     up = None if table is None else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32, device="cpu")
-    seen = prepare_cloud(cloud, generator, clean=options.support == "camera", up=up)
+    seen = prepare_cloud(cloud, generator, options.support == "camera", up, neighbours)
     if not in_image:  # a scene has cut its objects out
         _warn_of_table(seen, None if table is None else Plane.horizontal(table))
     # The camera of a depth image is known, an estimated one is a guess, a whole surface has none.
