@@ -18,7 +18,7 @@ from torchgrasp.shape.completion.complete import (
     Completion,
     complete_cloud,
 )
-from torchgrasp.shape.completion.silhouette import _project, silhouette
+from torchgrasp.shape.completion.silhouette import _distance, _Projection, silhouette
 from torchgrasp.shape.completion.symmetry import SymmetryScorer, planes_near, reflect
 from torchgrasp.shape.surface import extract_surface
 
@@ -183,10 +183,21 @@ def _without_symmetry(cloud: PointCloud) -> PointCloud:
 
 def test_project_faces_the_middle_of_the_points():
     corners = real([[-1.0, -2, 3], [5, 4, 9], [0, 0, 4]])
-    axes, pixels, depth = _project(torch.cat([corners, real([[2.0, 1, 6]])]), real([10.0, 7, -2]))
-    near(pixels[-1], torch.zeros(2, dtype=torch.float64), 1e-12)
-    torch.testing.assert_close(axes @ axes.T, torch.eye(3, dtype=torch.float64))
-    assert float(depth[-1]) == pytest.approx(164**0.5)
+    seen = _Projection.of(torch.cat([corners, real([[2.0, 1, 6]])]), real([10.0, 7, -2]))
+    near(seen.pixels[-1], torch.zeros(2, dtype=torch.float64), 1e-12)
+    torch.testing.assert_close(seen.axes @ seen.axes.T, torch.eye(3, dtype=torch.float64))
+    assert float(seen.depths[-1]) == pytest.approx(164**0.5)
+
+
+def test_distances_are_those_of_the_nearest_cell_outside_the_mask():
+    """Of a mask that reaches one side of the raster, and of an empty one."""
+    generator = torch.Generator().manual_seed(5)
+    mask = torch.zeros(14, 17, dtype=torch.bool)
+    mask[3:11, 9:] = torch.rand(8, 8, generator=generator) < 0.9
+    cells = torch.cartesian_prod(torch.arange(14), torch.arange(17)).double()
+    apart = torch.cdist(cells, cells[~mask.flatten()], compute_mode="donot_use_mm_for_euclid_dist")
+    assert torch.equal(torch.from_numpy(_distance(mask.numpy())).flatten(), apart.amin(1))
+    assert not _distance(~mask.numpy() & mask.numpy()).any()
 
 
 def test_silhouette_of_a_ball_is_its_circle():

@@ -5,6 +5,7 @@ over the depth.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -245,15 +246,13 @@ def silhouettes(cloud: PointCloud) -> Outlines:
     Raises `BadArgument` for a view without viewpoint, or one that shows both sides of the object.
     """
     views = cloud.split_views()
-    for view in views:
-        if view.viewpoint is None:
-            raise BadArgument("cloud", "no viewpoint", "a cloud with viewpoints")
-        _check_view(view.points, view.viewpoint)
-    return Outlines(tuple(silhouette(view) for view in views))
+    if any(view.viewpoint is None for view in views):
+        raise BadArgument("cloud", "no viewpoint", "a cloud with viewpoints")
+    return Outlines(tuple(map(silhouette, views)))
 
 
 def silhouette(view: PointCloud) -> Silhouette:
-    """Return the silhouette of one view [m], whose points must all lie in front of the camera.
+    """Return the silhouette of one view [m]; raise `BadArgument` for one that shows both sides.
 
     Within the outline there may be gaps, where nothing was measured. A gap counts as a hole (free
     space) only if it is wide. It must be far wider than the surface around it, as in a frame of
@@ -261,9 +260,11 @@ def silhouette(view: PointCloud) -> Silhouette:
     gap, too.
     """
     assert view.viewpoint is not None
-    axes, pixels, depths = (t.numpy() for t in _project(view.points, view.viewpoint))
-    distance, _ = spatial.KDTree(pixels).query(pixels, k=min(OUTLINE.neighbours, len(pixels)))
-    spacing = float(np.median(distance[:, -1]))
+    image = _check_view(view.points, view.viewpoint)
+    axes = image.axes.numpy()
+    pixels = image.pixels.numpy()
+    depths = image.depths.numpy()
+    spacing = float(np.median(image.apart[:, : OUTLINE.neighbours][:, -1]))
     disc = OUTLINE.grow * spacing
     low = pixels.min(0)
     size = pixels.max(0) - low
@@ -296,7 +297,7 @@ def silhouette(view: PointCloud) -> Silhouette:
     cut = bool(unseen.any())
     # the border of the image is no rim
     seen = _distance(~unseen) * cell > disc if cut else ~unseen
-    rim, rim_normals = _rim(outside, seen, corner, cell, pixels, depths)
+    rim, rim_normals = _rim(outside, seen, corner, cell, image)
 
     origin = view.viewpoint.double().cpu()
     axes = torch.from_numpy(axes)
@@ -365,20 +366,50 @@ def _beyond_image(
     return beyond
 
 
-def _check_view(points: Points, viewpoint: Float[Tensor, "3"]) -> None:
-    """Raise `BadArgument` for points that no camera at the viewpoint can see at once."""
+class _Projection(NamedTuple):
+    """The pixels of n points in the image of a camera that faces them, each with its k nearest.
+
+    The pixel itself comes first.
+    """
+
+    axes: Float[Tensor, "3 3"]  # unit vectors right, down and forward of the camera, one a line
+    pixels: Float[Tensor, "n 2"]  # positions at depth 1
+    depths: Float[Tensor, "n"]  # [m]
+    tree: "spatial.KDTree"  # of the pixels
+    apart: Float[Tensor, "n k"]  # distances of the nearest pixels at depth 1, ascending
+    nearest: Int[Tensor, "n k"]  # their indices
+
+    @classmethod
+    def of(cls, points: Points, viewpoint: Float[Tensor, "3"]) -> "_Projection":
+        """Return the image of points [m] that a camera at the viewpoint [m] has in front of it."""
+        points = points.double().cpu()
+        viewpoint = viewpoint.double().cpu()
+        forward = unit(find_middle(points) - viewpoint)
+        axes = torch.stack([*across(forward), forward])  # right, down, forward
+        local = (points - viewpoint) @ axes.T
+        pixels = local[:, :2] / local[:, 2:]
+        tree = spatial.KDTree(pixels.numpy())
+        count = min(max(BEHIND.neighbours, OUTLINE.neighbours), len(pixels))
+        near = tree.query(pixels.numpy(), k=count)
+        return cls(axes, pixels, local[:, 2], tree, *map(torch.from_numpy, near))
+
+
+def _check_view(points: Points, viewpoint: Float[Tensor, "3"]) -> _Projection:
+    """Return the image of points [m] at the viewpoint [m]; raise `BadArgument` if no camera there
+    can see them at once.
+    """
     forward = find_middle(points) - viewpoint
     behind = int(((points - viewpoint) @ forward <= 0).sum())
     if behind:
         found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
         needed = "the position of a camera that has the whole cloud in front of it"
         raise BadArgument("viewpoint", found, needed)
-    _, pixels, depth = _project(points, viewpoint)
-    count = min(BEHIND.neighbours, len(pixels))
-    apart, index = spatial.KDTree(pixels.numpy()).query(pixels.numpy(), k=count)
+    image = _Projection.of(points, viewpoint)
     # a surface as steep as 45 degrees is no second one
-    depth = depth[:, None]
-    deeper = depth - depth[torch.from_numpy(index), 0] - torch.from_numpy(apart) * depth  # (n, k)
+    depth = image.depths[:, None]
+    apart = image.apart[:, : BEHIND.neighbours]
+    seen = image.depths[image.nearest[:, : BEHIND.neighbours]]
+    deeper = depth - seen - apart * depth  # (n, k)
     points = points.double().cpu()
     radius = norm(points - find_middle(points)).max()
     share = float((deeper.amax(1) > BEHIND.radius * radius).double().mean())
@@ -386,26 +417,18 @@ def _check_view(points: Points, viewpoint: Float[Tensor, "3"]) -> None:
         found = f"{share:.0%} of the points behind others, which no camera sees at once"
         needed = "a single view, the viewpoint of each point, or outward normals"
         raise BadArgument("cloud", found, needed)
-
-
-def _project(
-    points: Points,
-    viewpoint: Float[Tensor, "3"],
-) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Return the axes of a camera that faces the points, and the points' image positions at depth 1
-    and depths [m].
-    """
-    points = points.double().cpu()
-    viewpoint = viewpoint.double().cpu()
-    forward = unit(find_middle(points) - viewpoint)
-    axes = torch.stack([*across(forward), forward])  # right, down, forward
-    local = (points - viewpoint) @ axes.T
-    return axes, local[:, :2] / local[:, 2:], local[:, 2]
+    return image
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:
     """Return the distance [cells] of each cell to the nearest cell outside the mask."""
-    return np.asarray(ndimage.distance_transform_edt(mask))
+    found = np.zeros(mask.shape)
+    # the mask's bounding box and the cells around it, one of which is nearer than any beyond
+    sides = [np.flatnonzero(mask.any(axis)) for axis in (1, 0)]
+    if len(sides[0]):
+        box = tuple(slice(max(side[0] - 1, 0), side[-1] + 2) for side in sides)
+        found[box] = ndimage.distance_transform_edt(mask[box])
+    return found
 
 
 def _rim(
@@ -413,8 +436,7 @@ def _rim(
     seen: np.ndarray,
     corner: np.ndarray,
     cell: float,
-    pixels: np.ndarray,
-    depths: np.ndarray,
+    image: _Projection,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return 16 evenly spread points of the outline at the depth of nearby pixels, and their
     surface normals.
@@ -429,9 +451,9 @@ def _rim(
     picks = pick_apart(torch.from_numpy(position), OUTLINE.rim).numpy()
     position = position[picks]
     slope = slope[picks]
-    count = min(OUTLINE.rim_neighbours, len(pixels))
-    _, index = spatial.KDTree(pixels).query(position, k=count)
-    depth = np.median(depths[index].reshape(len(position), -1), axis=-1)
+    count = min(OUTLINE.rim_neighbours, len(image.pixels))
+    _, index = image.tree.query(position, k=count)
+    depth = np.median(image.depths.numpy()[index].reshape(len(position), -1), axis=-1)
     ray = np.concatenate([position, np.ones((len(position), 1))], -1)
     # The cone's normal is perpendicular to the ray and to the outline's tangent, and leans with the
     # slope.
