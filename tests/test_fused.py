@@ -4,6 +4,7 @@ in Python.
 
 import dataclasses
 import importlib
+import math
 import sys
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from torchgrasp.contacts.problem import ContactProblem
 from torchgrasp.contacts.solver import Stage, descend, project, start_state
 from torchgrasp.foundation import fused
 from torchgrasp.foundation.base import Value, named_tensors
-from torchgrasp.foundation.errors import MissingExtra
+from torchgrasp.foundation.errors import IndefiniteCovariance, MissingExtra
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import farthest_points, unit
 from torchgrasp.geometry.mesh_distance import MeshSurface
@@ -36,7 +37,10 @@ from torchgrasp.ik.refine import grasp_residuals, open_hand, refine
 from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
 from torchgrasp.shape.completion.silhouette import Outlines
 from torchgrasp.shape.completion.symmetry import SymmetryScorer
+from torchgrasp.shape.conditioning import select_points
+from torchgrasp.shape.estimate import off_surface, on_surface
 from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.kernel import kernel_by_name
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -146,14 +150,24 @@ def test_farthest_and_nearest_points(both):
         assert bool(wanted[0].isinf().any())
 
 
-def test_choice_of_observed_points(both):
-    """The choice itself, and the posterior given the points."""
-    normals = unit(random(120, 3))
-    cloud = PointCloud(0.04 * normals, normals)
-    wanted, found = both(lambda: fit_shape(cloud, budget=40))
-    assert_close(found.x, wanted.x)
-    assert_close(found.factor, wanted.factor)
-    assert_close(found.weights, wanted.weights, 1e-7)  # the inverse of a covariance grows roundings
+@pytest.mark.parametrize("criterion", ["variance", "error", "both"])
+def test_choice_of_observed_points(both, criterion):
+    """The choice itself, and the posterior given the points; with a bound it ends early."""
+    x = unit(random(60, 3))
+    candidates = on_surface(x, x, torch.full_like(x[:, 0], 0.01), 0.05)
+    known = off_surface(1.2 * unit(random(9, 3, seed=1)), 0.2 + 0 * x[:9, 0], 0.01)
+    kernel = kernel_by_name("thin_plate", 3.6)
+    for stop in (-math.inf, 1.0):
+        wanted, found = both(
+            lambda stop=stop: select_points(candidates, known, kernel, 12, criterion, stop)
+        )
+        assert torch.equal(found.picks, wanted.picks)
+        assert (len(found.picks) == 12) == (stop < 0)
+        assert_close(found.posterior.factor, wanted.posterior.factor)
+        # the inverse of a covariance grows roundings
+        assert_close(found.posterior.weights, wanted.posterior.weights, 1e-7)
+    with pytest.raises(IndefiniteCovariance, match="a picked point"):
+        select_points(candidates, known, kernel_by_name("thin_plate", 2.0), 12, criterion)
 
 
 @pytest.mark.parametrize("size", [(2, 2), (9, 7)])

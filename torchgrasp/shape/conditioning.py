@@ -121,10 +121,34 @@ def select_points(
 
     Each choice appends four rows to the Cholesky factor.
     """
-    x = candidates.x
     start = posterior_given(known, kernel)
+    budget = min(budget, len(candidates.x))
+    choose = choose_points
+    if is_fused(candidates.x) and is_thin(kernel):
+        from torchgrasp.shape import fused_selection  # it imports numba
+
+        choose = fused_selection.choose_points
+    picks, factor, whitened = choose(start, candidates, budget, criterion, stop)
+    count = len(picks)
+    by_pick = torch.arange(4 * count, device=picks.device)
+    by_pick = by_pick.reshape(4, count).T.flatten()
+    return Selection(picks, _extend(start, candidates[picks], factor, whitened, by_pick))
+
+
+def choose_points(
+    start: Posterior,
+    candidates: Observations,
+    budget: int,
+    criterion: Criterion,
+    stop: float,
+) -> tuple[Int[Tensor, "picks"], Float[Tensor, "rows rows"], Float[Tensor, "rows"]]:
+    """Return the picks of `select_points`, the grown Cholesky factor L, and L^-1 y.
+
+    `start` is the posterior given the known observations. Rows of the factor go pick by pick.
+    """
+    x = candidates.x
+    kernel = start.kernel
     n = len(x)
-    budget = min(budget, n)
     old = len(start.factor)
     rows = old + 4 * budget
     # by columns, as the solver wants it: it copies any other matrix
@@ -140,11 +164,6 @@ def select_points(
     noise = torch.stack([candidates.distance_noise] + 3 * [candidates.normal_noise], 1) ** 2
     values = torch.cat([candidates.distance[:, None], candidates.normal], 1)
 
-    covariances = _pick_covariances
-    if is_fused(x) and is_thin(kernel):
-        from torchgrasp.shape import fused_jets  # it imports numba
-
-        covariances = fused_jets.pick_covariances
     picks = torch.empty(budget, dtype=torch.long, device=x.device)
     free = torch.zeros_like(error)  # minus infinity for the picks
     count = 0
@@ -154,8 +173,7 @@ def select_points(
         p = torch.argmax(free + _score(criterion, variance, error), keepdim=True)
         end = old + 4 * count
         new = slice(end, end + 4)
-        # rows of the factor go pick by pick
-        with_candidates, with_picks = covariances(kernel, x, p, picks[:count])
+        with_candidates, with_picks = _pick_covariances(kernel, x, p, picks[:count])
         cross = torch.cat([with_known[:, p].squeeze(1).T, with_picks])
         before = torch.linalg.solve_triangular(factor[:end, :end], cross, upper=False)
         own = prior + torch.diag(noise[p][0])
@@ -171,13 +189,8 @@ def select_points(
         picks[count] = p[0]
         free.index_fill_(0, p, -math.inf)
         count += 1
-    picks = picks[:count]
     rows = old + 4 * count
-    factor = factor[:rows, :rows]
-    by_pick = torch.arange(4 * count, device=x.device)
-    by_pick = by_pick.reshape(4, count).T.flatten()
-    new = candidates[picks]
-    return Selection(picks, _extend(start, new, factor, whitened[:rows, n], by_pick))
+    return picks[:count], factor[:rows, :rows], whitened[:rows, n]
 
 
 def _pick_covariances(

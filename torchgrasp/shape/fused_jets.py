@@ -7,11 +7,11 @@ import math
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.fused import array, compiled, inlined
-from torchgrasp.geometry.fused_vectors import add, dot, put
+from torchgrasp.geometry.fused_vectors import put
 from torchgrasp.geometry.linalg import Points
 from torchgrasp.shape.jets import Explain, Weighted
 from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries
@@ -46,19 +46,8 @@ def evaluate_jet(of: Weighted, x: Queries, explain: Explain) -> tuple[Tensor, ..
 def rows_at(known: Points, near: int, kernel: Kernel, x: Queries) -> CovarianceRows:
     """Return the covariance of the distances at q points with all observations."""
     found = x.new_empty(len(x), len(known) + 3 * near)
-    _put_rows(array(x), array(known.T), _psi_of(kernel), near, found.numpy())
+    _put_rows(array(x), array(known.T), psi_of(kernel), near, found.numpy())
     return found
-
-
-def pick_covariances(
-    kernel: Kernel, x: Points, p: Int[Tensor, "1"], picks: Int[Tensor, "picks"]
-) -> tuple[Float[Tensor, "4 n"], Float[Tensor, "rows 4"]]:
-    """Return the covariances of (d, w) at a point, as `torchgrasp.shape.conditioning` has them."""
-    with_all = x.new_empty(4, len(x))
-    with_picks = x.new_empty(4 * len(picks), 4)
-    found = with_all.numpy(), with_picks.numpy()
-    _put_covariances(array(x), int(p), picks.numpy(), _psi_of(kernel), *found)
-    return with_all, with_picks
 
 
 def _mean(arrays: Arrays, x: Queries, bent: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -78,10 +67,10 @@ def arrays_of(
     """
     shifts = a.new_zeros(len(b), 3, len(of.x))  # points without normals have weight 0
     shifts[..., : b.shape[2]] = b
-    return array(of.x.T), array(a), array(shifts), _psi_of(of.kernel)
+    return array(of.x.T), array(a), array(shifts), psi_of(of.kernel)
 
 
-def _psi_of(kernel: Kernel) -> float:
+def psi_of(kernel: Kernel) -> float:
     """Return the normalised length of a thin plate."""
     form = kernel.closed_form
     assert isinstance(form, partial)
@@ -171,32 +160,3 @@ def _put_rows(x, y, psi, near, rows):
                 rows[i, n + j] = first * d0
                 rows[i, n + near + j] = first * d1
                 rows[i, n + 2 * near + j] = first * d2
-
-
-@compiled
-def _put_covariances(x, p, picks, psi, with_all, with_picks):
-    """Write the results of `pick_covariances` for points x (n, 3)."""
-    for j in range(len(x)):
-        d0 = x[p, 0] - x[j, 0]
-        d1 = x[p, 1] - x[j, 1]
-        d2 = x[p, 2] - x[j, 2]
-        square = d0 * d0 + d1 * d1 + d2 * d2
-        r = math.sqrt(square)
-        first = 6.0 * (r - psi)
-        with_all[0, j] = square * (2.0 * r - 3.0 * psi) + psi**3
-        with_all[1, j] = first * d0
-        with_all[2, j] = first * d1
-        with_all[3, j] = first * d2
-    for c in range(len(picks)):
-        j = picks[c]
-        d = add(x[p], x[j], -1.0)
-        r = math.sqrt(dot(d, d))
-        second = 6.0 / r if r > 0.0 else 0.0
-        with_picks[4 * c, 0] = with_all[0, j]
-        for a in range(3):
-            # distance and gradient change their sign with the order of the points
-            with_picks[4 * c, 1 + a] = with_all[1 + a, j]
-            with_picks[4 * c + 1 + a, 0] = -with_all[1 + a, j]
-            for b in range(3):
-                with_picks[4 * c + 1 + b, 1 + a] = -second * d[a] * d[b]
-            with_picks[4 * c + 1 + a, 1 + a] -= 6.0 * (r - psi)
