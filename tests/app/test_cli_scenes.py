@@ -72,8 +72,8 @@ def middle(labels: np.ndarray, label: int) -> tuple[str, str]:
 
 @pytest.fixture(autouse=True)
 def no_report(monkeypatch):
-    monkeypatch.setattr("torchgrasp.app.cli.results.write_report", lambda path, run, view: path)
-    monkeypatch.setattr("torchgrasp.app.cli.results.write_viewer", lambda path, run: path)
+    monkeypatch.setattr("torchgrasp.app.report.page.write_report", lambda path, run, view: path)
+    monkeypatch.setattr("torchgrasp.app.report.viewer.write_viewer", lambda path, run: path)
 
 
 @pytest.mark.parametrize("click", [True, False])

@@ -18,7 +18,7 @@ from torchgrasp import (
     load_object,
     plan_grasps,
 )
-from torchgrasp.app.report.page import grasp_columns, grasp_rows
+from torchgrasp.app.report.run_data import grasp_columns, grasp_rows
 from torchgrasp.export import format_grasps
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate

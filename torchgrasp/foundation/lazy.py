@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import sys
 import types
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 
@@ -46,6 +47,21 @@ class _Parts(_Late):
             package.__class__ = _Package
             sys.modules[self.__name__] = package
         return importlib.import_module(f"{self.__name__}.{name}")
+
+
+def import_late(package: str, /, **modules: str) -> Callable[[str], Any]:
+    """Return the `__getattr__` of a package. It imports each of the package's own names when it is
+    first used, from the module of the package that is given by this name.
+    """
+
+    def find(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        found = getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
+        setattr(sys.modules[package], name, found)
+        return found
+
+    return find
 
 
 if TYPE_CHECKING:

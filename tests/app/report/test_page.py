@@ -8,8 +8,8 @@ import pytest
 from tests.scores import SCORES
 from torchgrasp import __version__
 from torchgrasp.app.report.evaluation_page import format_evaluation, write_evaluation
-from torchgrasp.app.report.page import TEMPLATES, format_page, grasp_rows, write_report
-from torchgrasp.app.report.run_data import closing_sentence, refusal, verdict
+from torchgrasp.app.report.page import TEMPLATES, format_page, write_report
+from torchgrasp.app.report.run_data import closing_sentence, grasp_rows, refusal, verdict
 from torchgrasp.app.report.viewer import write_viewer
 from torchgrasp.evaluation.intervals import share_over
 from torchgrasp.files import template_engine

@@ -2,6 +2,13 @@
 first hand.toml.
 """
 
-from torchgrasp.app.author.draft import Draft, Wish, clean_arm, draft_hand, new_hand
+from typing import TYPE_CHECKING
+
+from torchgrasp.foundation.lazy import import_late
+
+if TYPE_CHECKING:
+    from torchgrasp.app.author.draft import Draft, Wish, clean_arm, draft_hand, new_hand
 
 __all__ = ["Draft", "Wish", "clean_arm", "draft_hand", "new_hand"]
+
+__getattr__ = import_late(__name__, **dict.fromkeys(__all__, "draft"))

@@ -22,7 +22,6 @@ from torchgrasp.app.cli.command import (
     option,
     positional,
 )
-from torchgrasp.app.cli.live import shoot_scene
 from torchgrasp.app.cli.results import (
     ENOUGH,
     describe_run,
@@ -31,9 +30,7 @@ from torchgrasp.app.cli.results import (
     table_under,
     write_run,
 )
-from torchgrasp.app.report.page import grasp_columns, grasp_rows
-from torchgrasp.app.report.recording import import_rerun, write_recording
-from torchgrasp.app.report.run_data import Run, verdict
+from torchgrasp.app.report.run_data import Run, grasp_columns, grasp_rows, verdict
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.pose import find_plausible
 from torchgrasp.data.shipped import find_view
@@ -177,6 +174,8 @@ class Grasp(ForPrograms):
         out = Path("out") / inputs.object_name(path) if self.out is None else self.out
         inputs.check_folder(out)
         if self.rerun:
+            from torchgrasp.app.report.recording import import_rerun  # it takes long to import
+
             import_rerun()
         scene = self.realsense or is_scene(path)
         self._check_choice(scene)
@@ -184,6 +183,8 @@ class Grasp(ForPrograms):
         _ = self._task, self._friction  # refused before any work
         hand, among = inputs.load_fingers(self.hand, self.fingers)
         if self.realsense:
+            from torchgrasp.app.cli.live import shoot_scene  # it takes long to import
+
             path = shoot_scene(out, self.serial, self.view)
         grasp = self._grasp_scene if scene else self._grasp_cloud
         return grasp(path, out, hand, among)
@@ -557,6 +558,8 @@ class Grasp(ForPrograms):
         """
         paths = write_run(out, run, pages=not self.no_report)
         if self.rerun:
+            from torchgrasp.app.report.recording import write_recording
+
             paths.append(write_recording(out / "run.rrd", run))
         return ", ".join(map(str, paths))
 

@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from torchgrasp.app.cli.command import naming
-from torchgrasp.app.report.page import write_report
 from torchgrasp.app.report.run_data import Run, verdict
-from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.data.shipped import DATA, list_objects, load_object
 from torchgrasp.export import save_surface
 from torchgrasp.export.play import stand
@@ -76,6 +74,9 @@ def write_run(out: Path, run: Run, pages: bool) -> list[Path]:
     if len(run.executable):
         paths.append(save_surface(stand(run.surface, run.grasps.table), out / SURFACE))
     if pages:
+        from torchgrasp.app.report.page import write_report  # they take long to import
+        from torchgrasp.app.report.viewer import VIEW, write_viewer
+
         paths += [write_report(out / REPORT, run, VIEW), write_viewer(out / VIEW, run)]
     return paths
 

@@ -5,7 +5,8 @@ import html
 import io
 
 from torchgrasp.app.report import stills
-from torchgrasp.app.report.page import encode_base64, grasp_columns, grasp_rows
+from torchgrasp.app.report.page import encode_base64
+from torchgrasp.app.report.run_data import grasp_columns, grasp_rows
 from torchgrasp.cloud.agreement import check_seen
 from torchgrasp.data.accept import CloudLike, HandLike, as_cloud
 from torchgrasp.files import format_columns

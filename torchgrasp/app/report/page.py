@@ -1,7 +1,6 @@
 """The HTML report of one run with pictures, and the rendering of all pages."""
 
 import base64
-import math
 from pathlib import Path
 from typing import Any
 
@@ -9,28 +8,15 @@ from torchgrasp import __version__, files
 from torchgrasp.app.report import stills
 from torchgrasp.app.report.canvas import FINGERS
 from torchgrasp.app.report.film import describe_film, draw_film
-from torchgrasp.app.report.run_data import Run, verdict
+from torchgrasp.app.report.run_data import Run, grasp_columns, grasp_rows, verdict
 from torchgrasp.app.report.scene_picture import encode_scene
 from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.checks import checked
-from torchgrasp.values.planning import Grasps, format_success
 
 TEMPLATES = Path(__file__).with_name("templates")  # of all pages
 ASIDE = 60.0  # between the two views of a grasp [degrees]
 FILM_TURN = 20.0  # of the film's view, so that fingers in line do not hide each other [degrees]
 Sections = dict[str, list[tuple[str, bytes]]]  # captions and PNGs by the title of a section
-GRASP_COLUMNS = (
-    "rank",
-    "success",
-    "tip error mm",
-    "clearance mm",
-    "pad angle deg",
-    "closure margin",
-    "surface std mm",
-)
-"""Titles of the columns of a table of grasps; errors, angles and standard deviations are those of
-the worst finger.
-"""
 
 
 @checked
@@ -147,38 +133,6 @@ def format_page(run: Run, pictures: Sections, view: str = "") -> str:
             *((name.replace("_", " "), value) for name, value in sorted(run.grasps.meta.items())),
         ],
     )
-
-
-def grasp_columns(grasps: Grasps) -> tuple[str, ...]:
-    """Return the titles of the columns of `grasp_rows`.
-
-    These are `GRASP_COLUMNS` and, for grasps planned for a task, "task margin".
-    """
-    return (*GRASP_COLUMNS, *["task margin"] * (grasps.certificate.task_margin is not None))
-
-
-def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
-    """Return the cells of a table of the first `most` grasps as text, one tuple for each grasp.
-
-    The cells are in the order of `grasp_columns`.
-    """
-    rows = []
-    for rank, grasp in enumerate(grasps[:most], 1):
-        std_m = grasp.contacts.std_m
-        task = grasp.certificate.task_margin
-        row = [
-            str(rank),
-            format_success(grasp),
-            f"{1e3 * float(grasp.tip_error[0].max()):.2f}",
-            f"{1e3 * float(grasp.clearance[0]):.1f}",
-            f"{math.degrees(float(grasp.normal_angle[0].max())):.0f}",
-            f"{float(grasp.certificate.margin[0]):.4f}",
-            "" if std_m is None else f"{1e3 * float(std_m[0].max()):.1f}",
-        ]
-        if task is not None:
-            row.append(f"{float(task[0]):.2f}")
-        rows.append(tuple(row))
-    return rows
 
 
 def encode_base64(data: bytes) -> str:

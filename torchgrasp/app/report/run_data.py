@@ -17,8 +17,21 @@ from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.second_view import NextView
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values.closing import ClosureResult
-from torchgrasp.values.planning import ContactPlan, Grasps, PointCloud
+from torchgrasp.values.planning import ContactPlan, Grasps, PointCloud, format_success
 from torchgrasp.values.specs import ContactSpec
+
+GRASP_COLUMNS = (
+    "rank",
+    "success",
+    "tip error mm",
+    "clearance mm",
+    "pad angle deg",
+    "closure margin",
+    "surface std mm",
+)
+"""Titles of the columns of a table of grasps; errors, angles and standard deviations are those of
+the worst finger.
+"""
 
 
 @checked
@@ -158,6 +171,38 @@ def closing_sentence(run: Run) -> str:
         f"The {run.hand.name} hand held the {run.object_name}: lifted {rise:.2f} m, "
         f"moved {1e3 * moved:.0f} mm and {math.degrees(angle):.0f} deg in the hand."
     )
+
+
+def grasp_columns(grasps: Grasps) -> tuple[str, ...]:
+    """Return the titles of the columns of `grasp_rows`.
+
+    These are `GRASP_COLUMNS` and, for grasps planned for a task, "task margin".
+    """
+    return (*GRASP_COLUMNS, *["task margin"] * (grasps.certificate.task_margin is not None))
+
+
+def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
+    """Return the cells of a table of the first `most` grasps as text, one tuple for each grasp.
+
+    The cells are in the order of `grasp_columns`.
+    """
+    rows = []
+    for rank, grasp in enumerate(grasps[:most], 1):
+        std_m = grasp.contacts.std_m
+        task = grasp.certificate.task_margin
+        row = [
+            str(rank),
+            format_success(grasp),
+            f"{1e3 * float(grasp.tip_error[0].max()):.2f}",
+            f"{1e3 * float(grasp.clearance[0]):.1f}",
+            f"{math.degrees(float(grasp.normal_angle[0].max())):.0f}",
+            f"{float(grasp.certificate.margin[0]):.4f}",
+            "" if std_m is None else f"{1e3 * float(std_m[0].max()):.1f}",
+        ]
+        if task is not None:
+            row.append(f"{float(task[0]):.2f}")
+        rows.append(tuple(row))
+    return rows
 
 
 def refusal(run: Run) -> str:

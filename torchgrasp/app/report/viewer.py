@@ -22,15 +22,9 @@ from torch import Tensor
 from torchgrasp.app.report.canvas import FINGERS, OBJECT, TABLE, color_std, map_colors
 from torchgrasp.app.report.closing_moments import mass_centre, moments_of
 from torchgrasp.app.report.film import describe_film
-from torchgrasp.app.report.page import (
-    TEMPLATES,
-    encode_base64,
-    grasp_columns,
-    grasp_rows,
-    render,
-)
+from torchgrasp.app.report.page import TEMPLATES, encode_base64, render
 from torchgrasp.app.report.raster import FULL
-from torchgrasp.app.report.run_data import Run, verdict
+from torchgrasp.app.report.run_data import Run, grasp_columns, grasp_rows, verdict
 from torchgrasp.app.report.solids import link_poses, solids_of_links
 from torchgrasp.app.report.stills import facing, mesh_arrays, to_array, view_of
 from torchgrasp.cloud.agreement import check_seen
