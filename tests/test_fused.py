@@ -150,6 +150,25 @@ def test_farthest_and_nearest_points(both):
         assert bool(wanted[0].isinf().any())
 
 
+def test_scores_of_mirror_planes_and_the_space_beside_an_outline(both):
+    """Some images are far from the cloud, some outside the outline or below the table; points lie
+    beside the raster and behind the camera, too.
+    """
+    normals = unit(random(240, 3))
+    normals = normals[normals[:, 0] > 0.2]
+    seen = PointCloud(0.03 * normals, normals, torch.tensor([0.5, 0.0, 0.1]).double())
+    scorer = SymmetryScorer.of(seen, -0.025)
+    planes = torch.cat([unit(random(12, 3, seed=1)), 0.03 * random(12, 1, seed=2)], 1)
+    for wanted, found in zip(*both(lambda: scorer.score(planes)), strict=True):
+        assert wanted.unique().numel() > 8
+        assert_close(found, wanted)
+    points = torch.cat([0.06 * random(80, 3, seed=3), random(20, 3, seed=4)])[None]
+    for look in (scorer.outline.violation, scorer.outline.hull_distance):
+        wanted, found = both(lambda look=look: look(points))
+        assert (wanted > 0).any() and not (wanted > 0).all()
+        assert_close(found, wanted)
+
+
 @pytest.mark.parametrize("criterion", ["variance", "error", "both"])
 def test_choice_of_observed_points(both, criterion):
     """The choice itself, and the posterior given the points; with a bound it ends early."""

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, rotate
@@ -162,6 +163,13 @@ class Silhouette(Value):
         """Return each point's distance to the outline at depth 1, the depth [m] seen there, and its
         own depth [m].
         """
+        if is_fused(points, self.outside):
+            from torchgrasp.shape.completion import fused_symmetry  # it imports numba
+
+            camera = self.viewpoint, self.axes, self.corner
+            rasters = self.outside, self.depth
+            least = OUTLINE.least_depth
+            return fused_symmetry.look_up(points, camera, self.cell, rasters, least)
         local = (points - self.viewpoint) @ self.axes.T
         depth = local[..., 2].clamp_min(OUTLINE.least_depth)
         position = (local[..., :2] / depth[..., None] - self.corner) / self.cell

@@ -225,10 +225,19 @@ class SymmetryScorer:
         violation. The violation of free space is in [0, 1].
         """
         points, normals = self.probes
-        mirrored = reflect(points, planes[:, None])  # (p, k, 3)
-        turned = reflect_directions(normals, planes[:, None])
-        distance, index = self.nearest(mirrored, SYMMETRY.far * SYMMETRY.match)
-        agreement = (turned * self.normals[index]).sum(-1).clamp_min(0)
+        far = SYMMETRY.far * SYMMETRY.match
+        if is_fused(planes, points):
+            from torchgrasp.shape.completion import fused_symmetry  # it imports numba
+
+            mirrored, distance, cosine = fused_symmetry.match_images(
+                self.probes, self.normals, self.boxes, planes, far
+            )
+        else:
+            mirrored = reflect(points, planes[:, None])  # (p, k, 3)
+            turned = reflect_directions(normals, planes[:, None])
+            distance, index = self.nearest(mirrored, far)
+            cosine = (turned * self.normals[index]).sum(-1)
+        agreement = cosine.clamp_min(0)
         near = torch.exp(-0.5 * (distance / SYMMETRY.match) ** 2)
         match = (near * agreement).mean(-1)
         depth = self.outline.violation(mirrored)
