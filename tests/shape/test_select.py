@@ -10,7 +10,13 @@ from tests.make import covariance, dense_posterior, near, real
 from torchgrasp.foundation.base import join
 from torchgrasp.foundation.errors import IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.shape.conditioning import Criterion, Selection, posterior_given, select_points
+from torchgrasp.shape.conditioning import (
+    Criterion,
+    Selection,
+    longest_distance,
+    posterior_given,
+    select_points,
+)
 from torchgrasp.shape.estimate import Observations, on_surface
 from torchgrasp.shape.kernel import Kernel, KernelName, kernel_by_name
 
@@ -88,6 +94,14 @@ def test_informative_points_leave_less_variance_and_picking_stops_when_all_is_ce
     for rows, certain in ((picks, True), (picks[:-1], False)):
         worst = float(_distances(join([known, points[rows]]), PLATE, points.x)[1].max())
         assert (worst <= 0.01) == certain
+
+
+@pytest.mark.parametrize("axes", [[1.0, 1.0, 1.0], [1.0, 0.3, 0.0], [0.0, 0.0, 0.0]])
+def test_the_longest_distance_is_that_of_all_pairs(axes: list[float]):
+    x = unit(torch.randn(300, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)))
+    x = 5 + x * real(axes)
+    every = (x[:, None] - x).square().sum(-1).sqrt()
+    assert longest_distance(x) == pytest.approx(float(every.max()), rel=1e-15)
 
 
 @pytest.mark.parametrize("criterion", ["variance", "both"])

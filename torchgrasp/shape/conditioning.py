@@ -15,12 +15,14 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Value, map_tensors
 from torchgrasp.foundation.fused import is_fused
-from torchgrasp.geometry.linalg import Points, cholesky
+from torchgrasp.geometry.linalg import Points, cholesky, norm
 from torchgrasp.shape.estimate import Observations
 from torchgrasp.shape.kernel import Kernel, covariance_rows, cross_covariance, gram, is_thin
 from torchgrasp.shape.posterior import Posterior
 
 Criterion = Literal["variance", "error", "both"]
+# factor that lowers a bound on distances by more than rounding
+BELOW = 1.0 - 1e-9
 
 
 def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
@@ -52,7 +54,11 @@ def check_kernel(posterior: Posterior, least_noise: float) -> None:
 def longest_distance(x: Points) -> float:
     """Return the longest distance between any two of the points (n, 3), in their unit."""
     x = x.detach()
-    return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())
+    away = norm(x - x.mean(0))
+    # no pair is farther apart than the sum of its distances from the middle
+    known = norm(x - x[away.argmax()]).max()
+    ends = x[away + away.max() >= BELOW * known]
+    return float(torch.cdist(ends, ends, compute_mode="donot_use_mm_for_euclid_dist").max())
 
 
 def append_observations(
