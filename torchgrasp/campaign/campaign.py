@@ -119,7 +119,8 @@ def run_campaign(
 
     Raises:
         DatasetError: no manifest, or none of the objects is in it.
-        BadArgument: an unknown protocol, no Dask scheduler at the address, or "cuda" without one.
+        BadArgument: an unknown protocol, or no Dask scheduler at the address `workers`.
+        BadArgument: `spec.device` is "cuda", but `workers` is not the address of a Dask scheduler.
         BadArgument: a machine of the cluster has other versions or another hand.
         OutputError: the folder holds another campaign or other files, another run uses it, or it
             cannot be written.

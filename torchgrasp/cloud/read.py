@@ -157,10 +157,18 @@ def read_cloud_file(
     viewpoint: Sequence[float | int] | Tensor | None = None,
     unit: Literal["m", "cm", "mm"] = "m",
 ) -> CloudFile:
-    """Read a cloud of any extent, such as a whole scene. The result also has its table, and notes
+    """Read a cloud of any extent, such as a whole scene. Return it with the file's table, and notes
     on what was left out.
 
-    Formats, arguments and what is left out are those of `read_cloud`.
+    `read_cloud` lists the formats, and which points are left out. The table is the plane that the
+    file holds, as `save_cloud` writes it. It is not searched for among the points.
+
+    Args:
+        path: the file.
+        viewpoint: the camera's position (3,) [m] in the cloud's frame. It replaces the file's
+            viewpoint and frustum. None keeps those of the file.
+        unit: unit of all lengths in the file, "m", "cm" or "mm". The result is in metres, and so is
+            the argument `viewpoint`.
 
     Raises:
         CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5

@@ -101,9 +101,12 @@ class ShapeLike(Protocol):
         ...
 
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Return points (*b, 3) [m] of the cloud's frame as normalised points (*b, 3).
+        """Return points (*b, 3) [m] of the cloud's frame as normalised points (*b, 3), without
+        unit.
 
-        b stands for any batch axes.
+        They are shifted to the normalised origin, then divided by `scale` [m]. The origin is the
+        centre of the ball of `domain_radius` in which the shape is known. b stands for any batch
+        axes.
         """
         ...
 

@@ -36,7 +36,7 @@ class Region(Value):
     """A region of space in the frame of the cloud, as a signed distance.
 
     `plan_grasps` takes a region as `keep` or `avoid`, and a `ContactSpec` as `region`. `box`,
-    `mesh`, `mask` and `rim` return usual regions. Call a region to get signed distances.
+    `mesh`, `mask` and `rim` make common regions. Call a region to get signed distances.
 
     Args:
         distance: function of points (n, 3) [m] in float64 that returns their signed distances (n,)

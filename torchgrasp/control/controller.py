@@ -236,9 +236,10 @@ class GraspController:
         """Shift the approach, the straight path to the pre-grasp, to the object as a new view shows
         it.
 
-        Call it before the first `step`. Then move the hand by `targets.palm` [m], where the shifted
-        approach begins. The palm does not rotate: the contacts of a turned object are found by
-        touch.
+        Call it before the first `step`. Then move the hand to where the shifted approach begins.
+        `targets.palm` (3,) [m] of this controller is now the hand's displacement from the start of
+        the planned approach. The displacement is in the frame of the hand's root link at the
+        planned pose. The palm does not rotate: the contacts of a turned object are found by touch.
 
         `cloud` holds points [m] of the object alone, in the frame of the planned cloud. Raises
         `BadArgument` if the hand has no approach, or has begun it.

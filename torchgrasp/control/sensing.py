@@ -75,15 +75,17 @@ def feel_torques(
     """Return the tactile state, readings and filters, of f fingertips whose forces are estimated
     from joint torques.
 
-    j counts all joints of the URDF. Contact points and normals of the state are NaN.
+    j counts all joints of the URDF, in the order of `hand.tree.joint_names`. Contact points and
+    normals of the state are NaN.
 
     Args:
         tactile: the state at the last tick; `no_contact` returns the first one.
         reference: the closing plan; its normals give the direction in which a finger presses.
-        jacobian: Jacobian (f, 3, j) [m/rad] of the centres of the fingertips
-            (`Observation.jacobian`).
-        torques: torques (j,) [N m] by which the joints press on the object, each positive in the
-            direction of its joint. Torques of weight, friction and acceleration are subtracted.
+        jacobian: Jacobian (f, 3, j) [m/rad, or no unit for a sliding joint] of the centres of the
+            fingertips. It is in the frame of the hand's root link (`Observation.jacobian`).
+        torques: torques (j,) [N m, or N for a sliding joint] by which the joints press on the
+            object. Each is positive in the direction of its joint. The caller must first subtract
+            the torques of weight, friction and acceleration.
         period: time [s] since the last readings.
 
     Raises `BadArgument` for a Jacobian with the shape of another hand.

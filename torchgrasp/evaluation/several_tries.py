@@ -67,7 +67,12 @@ def lift_grasps(
         spec: parameters of the trial; None means `TrialSpec()`.
         tries: largest number of tries. With 1 the trial is that of `close_hand`.
 
-    Raises the errors of `close_hand`.
+    Raises:
+        BadArgument: joints are of another hand, or a pre-grasp is outside the joint limits.
+        BadArgument: contacts are off the mesh, or the mesh does not stand on the table.
+        BadArgument: the approach of the first grasp is no unit vector.
+        MeshError: the mesh is missing, open or without volume.
+        MissingExtra: the simulator is not installed.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -58,17 +58,36 @@ class ProtocolResult(Value):
         tries: number of grasps that were tried. `rank`, `predicted`, `overlap`, `gap_mm`,
             `deepest_mm` and `touch` are those of the first grasp, all other numbers those of the
             last.
-        cause: why a lift did not hold the object: "start overlap", "toppled", "pushed away",
-            "ejected", "shape off", or "never met". Or it is "too weak", "dropped when pushed",
-            "turned" or "slid". It is "" if the object was held, if the simulation diverged, or in
-            pulls.
-        size: number that goes with the `cause`. It is an angle [deg] for "toppled" and "turned",
-            and a force [N] for "too weak" and "dropped when pushed". For other causes it is a
-            distance [mm].
+        cause: why a lift did not hold the object: the first cause below that applies. It is "" if
+            the object was held, if the simulation diverged, or in pulls.
+        size: number that goes with the `cause`, in the unit given below; NaN without a cause.
         gap_mm: largest gap [mm] between a fingertip and the object at the planned posture. It is
             measured before any force and without a pose error.
         deepest_mm: smallest such gap [mm]; negative if the fingertip penetrates the object.
         touch: verdict on these gaps, such as "touches" (`Touch.verdicts`); "" if unknown.
+
+    The causes, each with its `size`:
+
+    * "start overlap": the opened hand overlapped the object or the table. The size is the depth
+      [mm].
+    * "toppled": the object tilted by more than 30 degrees before the lift. The size is the tilt
+      [deg].
+    * "pushed away": the object moved by more than 20 mm before all fingers touched. The size is its
+      motion [mm].
+    * "ejected": the object moved by more than 20 mm between the last touch and the lift. The size
+      is its motion [mm].
+    * "shape off": a planned contact was more than 10 mm off the true surface. The size is the
+      largest such distance [mm].
+    * "never met": a finger never touched. The size is the distance [mm] of its planned contact from
+      the true surface.
+    * "too weak": the drives were at their limits, or the hand felt a load that it cannot hold. The
+      size is the largest normal force [N] of a finger before the lift.
+    * "dropped when pushed": the lifted object was lost under the push of `TrialSpec.push`. The size
+      is the force [N] of the push.
+    * "turned": the object turned in the closed hand by more than 30 degrees, before it slid. The
+      size is its largest rotation [deg].
+    * "slid": the object slid in the closed hand, or hung on one finger. The size is its largest
+      motion [mm] in the hand.
     """
 
     rank: int

@@ -61,13 +61,19 @@ class Touch(Value):
 
     @property
     def largest(self) -> Float[Tensor, "g"]:
-        """The largest gap (g,) [m] of each grasp; NaN if no gap of the grasp is known."""
+        """The largest of the f gaps of each grasp (g,) [m]; NaN if none of them is known.
+
+        A gap is the signed distance of a fingertip from the object's surface at the planned
+        posture. It is negative if the fingertip penetrates the object.
+        """
         return _known(self.gaps.nan_to_num(-torch.inf).amax(-1))
 
     @property
     def deepest(self) -> Float[Tensor, "g"]:
-        """The smallest gap (g,) [m] of each grasp, negative if a fingertip penetrates; NaN if none
-        is known.
+        """The smallest of the f gaps of each grasp (g,) [m]; NaN if none of them is known.
+
+        A gap is the signed distance of a fingertip from the object's surface at the planned
+        posture. It is negative if the fingertip penetrates the object.
         """
         return _known(self.gaps.nan_to_num(torch.inf).amin(-1))
 

@@ -46,7 +46,8 @@ class ActuatedJoints(Value):
         lower: lower limits (h,) [rad, or m for a sliding joint].
         upper: upper limits (h,) [rad or m].
         coupling: matrix (j, h): the motion of each movable joint for a unit motion of each actuated
-            joint.
+            joint. It has no unit between joints of one kind. It is [m/rad] for a sliding joint that
+            follows a turning one, and [rad/m] in the opposite case.
         offset: positions (j,) [rad or m] of the movable joints if all actuated joints are at 0.
 
     >>> from torchgrasp import load_hand

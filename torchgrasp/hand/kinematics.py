@@ -32,23 +32,33 @@ class KinematicTree(Value):
     """The forward kinematics of a URDF, as tensors for its l links and j movable joints. A `Hand`
     holds it as `tree`.
 
-    The root link of a hand is its palm. `Fingertips.chains` holds only the part of the tree that
-    leads to the fingertips. In `tables`, `joint` and `parent`, links are sorted by level: the
-    number of joints between root and link.
+    Call `poses` to get the poses of all links for given joint positions. `frames` returns them in
+    another layout, and `joint_axes` the axes of the joints. These functions use the attributes.
+
+    The root link of a hand is its palm. A tree can be a part of a URDF: `Fingertips.chains` holds
+    only the links that lead to the fingertips. The joints are always those of the whole URDF.
+
+    In `tables`, `joint` and `parent`, links are sorted by level. The level of a link is the number
+    of joints between root and link, fixed ones too.
 
     Attributes:
         link_names: names of the l links, in the order of the URDF.
         joint_names: names of the j movable joints, in the order of the URDF.
-        child: index (j,) of the link that each joint moves; 0 if that link is outside this part.
+        child: index (j,) in `link_names` of the link that each joint moves. If this link is not in
+            the tree, the index is 0 without a meaning: the joint's column of `moves` is 0.
         axis: unit axis (j, 3) of each joint, in the frame of the link that it moves.
         prismatic: numbers (j,), 1 for a sliding joint and 0 for others.
-        moves: numbers (l, j), 1 if the joint moves the link and 0 if not.
+        moves: numbers (l, j), 1 if the joint moves the link and 0 if not; links are in the order of
+            `link_names`.
         tables: pose [m] of each link in its parent as four 3 x 4 tables (4, 3, 4, l, 1). The first
             is the constant part. The others are multiplied by sin q, cos q and q, where q is the
             position of the link's joint.
-        joint: index (l,) of the joint between each link and its parent; 0 if the link is fixed.
-        parent: index (l,) of each link's parent among the links of the level above.
-        level_sizes: number of links in each level.
+        joint: index (l,) in `joint_names` of the joint between each link and its parent. For a
+            fixed link and the root it is 0 without a meaning: their `tables` have only the constant
+            part.
+        parent: index (l,) of each link's parent among the links of the level above; 0 for the root,
+            which has no parent.
+        level_sizes: number of links in each level, the root's first.
         places: index (l,) of each of `link_names` among the sorted links.
         slides: whether any joint is prismatic.
 

@@ -112,14 +112,15 @@ def plan_scene(
     """Plan grasps of the objects in a scene; return a plan for each, the greatest predicted success
     first.
 
-    Nothing is planned for an object whose image shows that it cannot be grasped
-    (`Status.FEW_PIXELS` to `TOO_WIDE`). The same holds if its estimated shape may be off by more
-    than half the object (`TOO_VAGUE`). Of the other objects, near and tall ones with free space
-    around them are planned first. Objects at the image border, or too large for a prediction of
-    success, are planned last.
+    Nothing is planned for an object whose image shows that it cannot be grasped. Its `Status` is
+    then `FEW_PIXELS`, `OFF_TABLE`, `CUT_OFF`, `NO_DEPTH`, `TOO_LOW` or `TOO_WIDE`. The same holds
+    if its estimated shape may be off by more than half the object (`TOO_VAGUE`).
+
+    Of the other objects, tall ones near the camera with free space around them are planned first.
+    Objects at the image border, or too large for a prediction of success, are planned last.
 
     With a `target`, only this object is planned. If it has no grasp, it is planned again without
-    the nearest objects. `ScenePlan.clear` then lists the ones to take away.
+    the objects nearest to it. `ScenePlan.clear` then lists the ones to take away.
 
     Args:
         scene: objects on a table, or a file of `save_scene`.

@@ -244,9 +244,10 @@ class GraspMixture(GaussianMixture):
         derivatives.
 
         Args:
-            code: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch
-                axes. A `ContactCode` counts as its `q` (b, 6, 6), and the result is (b, 6). A code
-                that is not finite gives NaN.
+            code: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch axes.
+                A `ContactCode` counts as its `q` (b, 6, 6); the result is then (b, 6). Its second
+                axis counts the six assignments of the contacts to the fingers
+                (`ContactCode.permutation`). A code that is not finite gives NaN.
 
         Raises `BadArgument` for codes that do not have six numbers.
         """
@@ -263,9 +264,10 @@ class GraspMixture(GaussianMixture):
         They may exceed the joint limits.
 
         Args:
-            code: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch
-                axes. A `ContactCode` counts as its `q` (b, 6, 6), and the result is (b, 6, h). A
-                code that is not finite gives NaN.
+            code: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch axes.
+                A `ContactCode` counts as its `q` (b, 6, 6); the result is then (b, 6, h). Its
+                second axis counts the six assignments of the contacts to the fingers
+                (`ContactCode.permutation`). A code that is not finite gives NaN.
 
         Raises `BadArgument` for codes that do not have six numbers.
         """

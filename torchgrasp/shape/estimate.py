@@ -112,8 +112,11 @@ class Observations(Batch):
 
     @property
     def least_noise(self) -> float:
-        """The least of all standard deviations: of distances (normalised: one unit is
-        `Normalisation.scale` [m]), and of components of observed normals (no unit).
+        """The least standard deviation of the noise of all observed numbers.
+
+        It is the least of `distance_noise`, and of `normal_noise` at the observed normals. A
+        distance is normalised: one unit is `Normalisation.scale` [m]. A component of a normal has
+        no unit.
         """
         every = torch.cat([self.distance_noise, self.normal_noise[self.has_normal]])
         return float(every.detach().min())

@@ -394,8 +394,10 @@ class ShapeGP(Posterior, Normalisation):
         earlier ones. One normalised unit is `scale` [m].
 
         Kernel, `cloud` and the domain do not change. The domain is the ball in which the posterior
-        is valid. `update` does the same for points [m]. Raises `IndefiniteCovariance` for
-        observations too far outside the domain.
+        is valid. `update` does the same for points [m].
+
+        Raises `IndefiniteCovariance` if the covariance of the observations is not positive
+        definite. It may be so for observations far outside the domain.
         """
         return dataclasses.replace(self, **common_fields(append_observations(self, new), Posterior))
 

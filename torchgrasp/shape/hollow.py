@@ -205,11 +205,16 @@ class HollowShape(ShapeGP):
 
     @checked
     def append(self, new: Observations) -> "HollowShape":
-        """Return the vessel given further observations in its normalised frame.
+        """Return the vessel given further observations, in addition to all earlier ones.
 
-        Each observation changes the surface, outer or inner, that applies at its point (`wall_at`).
-        Its distance and normal are those from that surface. Raises `IndefiniteCovariance` for
-        observations too far outside the domain, the ball in which the posterior is valid.
+        They are in the vessel's normalised frame: one unit is `scale` [m]. Each observation changes
+        one surface, outer or inner: the one that applies at its point (`wall_at`). The observed
+        distance is the signed distance from this surface, positive outside the vessel and in its
+        cavity. The observed normal points there, too, away from the material. `cloud` and the
+        domain, the ball in which the posterior is valid, do not change.
+
+        Raises `IndefiniteCovariance` if the covariance of the observations is not positive
+        definite. It may be so for observations far outside the domain.
         """
         outer, inner = self.wall_at(new.x).T
         new_outer = self.outer.append(new[outer])

@@ -253,8 +253,8 @@ class SimulatedScene(abc.ABC):
             velocity: velocity (3,) [m/s] in the world's frame at which the target itself moves. 0
                 means that the mount comes to rest at `displacement`.
 
-        Raises `BadArgument` for arrays of another shape, or without numbers, and for a scene whose
-        `SceneSpec.yields` is 0.
+        Raises `BadArgument` unless both arrays have the shape (3,) and are integers or floats. It
+        is also raised for a scene whose `SceneSpec.yields` is 0.
         """
         for name, vector in (("displacement", displacement), ("velocity", velocity)):
             if vector.shape != (3,) or vector.dtype.kind not in "iuf":

@@ -77,7 +77,8 @@ class Disturbance(Value):
     * 2: contacts of other links than fingertips with the object.
 
     Attributes:
-        first_touch: time (3,) [s] of the first contact; infinite if there is none.
+        first_touch: time (3,) [s] of the first contact, from the start of the simulation as in
+            `ClosureResult.time`; infinite if there is none.
         impulse: sum (3,) of the normal impulses [N s].
         force: largest normal force (3,) [N], averaged over a control tick.
         early: mask (3,) of the kinds whose first contact was before a fingertip touched the object.
@@ -139,7 +140,7 @@ class ClosureResult(Value):
             by half the lift, and two fingers touch it at the end. It slipped by less than 20 mm and
             30 degrees.
         status: `OK`, or the reason why the object was not held.
-        time: times (t,) [s] at which the control ticks ended.
+        time: times (t,) [s] at which the control ticks ended, from the start of the simulation.
         forces: normal force (t, f) [N] of each fingertip; 0 without contact.
         object_pose: transform (t, 4, 4) in the frame of the grasp. It moves the mesh that
             `close_hand` was given to the object's place at the tick.

@@ -247,11 +247,11 @@ class Certificate(Batch):
         rank_ratio: the smallest singular value of W over its largest one (b,).
         residual: the largest component |W phi| (b,) of the balance found; infinite if there is
             none.
-        witness: a unit wrench v (b, 6). If the margin is at most 0 or -inf, v . w >= 0 for every
-            edge wrench w, up to rounding. So no contact force opposes v. For a set with force
-            closure, v proves that no greater margin is possible. The margin is -min(v . w) / sum(v
-            . w - min(v . w)) over the edge wrenches. If only the rank is too low, the wrenches are
-            smallest along v.
+        witness: a unit wrench v (b, 6), like w without unit, in the frame of the contacts. If the
+            margin is at most 0, v . w >= 0 for every edge wrench w, up to rounding. So no contact
+            force opposes v. For a set with force closure, v proves that no greater margin is
+            possible. The margin is -min(v . w) / sum(v . w - min(v . w)) over the edge wrenches. If
+            only the rank is too low, the wrenches are smallest along v.
         task_load: the load t (b, 6) that the contacts resist least, of the loads in the argument
             `resist` of `plan_grasps`. It is a force [N], then a torque [N m] about the contacts'
             centroid, in the frame of the cloud.
@@ -259,7 +259,8 @@ class Certificate(Batch):
             loads are resisted if it is at least 1.
         task_forces: contact forces (b, f, 3) [N] that balance this multiple of t, in the frame of
             the cloud.
-        task_strength: normal force (b, f) [N] up to which each finger presses in this proof.
+        task_strength: greatest normal force (b, f) [N] of each finger that `task_margin` and
+            `task_twist` assume. The torques of the finger's drives bound it.
         task_twist: proof (b, 6) [1/N, 1/(N m)] that no greater multiple is resisted. It is a twist
             y with y . t = -1. Along it, no admissible contact forces have a power greater than
             `task_margin`.

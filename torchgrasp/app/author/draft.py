@@ -114,16 +114,19 @@ class Wish(NamedTuple):
             means the last link of each branch.
         name: name of the hand; "" means the robot's name in the URDF.
         root: name of the hand's first link, if the URDF also has an arm. Links that are not below
-            it are left out. "" means the root link; in an MJCF, the body whose links have motors.
+            it are left out. "" means the root link of the URDF. In an MJCF it is the name of a
+            body. "" then means the body fixed to the world that carries the driven fingers. If
+            several bodies carry them, or one that itself moves, "" means the world.
         meshes: folder in which all mesh files lie; None means the folder of the URDF.
         visual: whether links without <collision> take their <visual> as collision shapes.
         tip_offset: lengths [m] by which tactile sensors extend the fingertips. () means no sensors.
             One number counts for all fingertips, several for each of `tips`; 0 adds no sensor. A
-            sensor points away from the axis of the finger's last joint, to the fingertip's end. The
-            pad, the part of the fingertip that touches objects, has a contact point. It moves by
-            this length; its normal stays.
+            sensor points along the perpendicular from the axis of the finger's last joint to the
+            fingertip's end. The pad is the part of the fingertip that touches objects. Its contact
+            point moves by the offset in this direction; its normal stays.
         tip_radius: radii [m] of the balls in which the sensors end, counted like `tip_offset`. ()
-            means the radii of the fingertips' own balls.
+            means the radii of the guessed pads, which are parts of balls. A flat pad has no such
+            radius; a sensor on it needs one here.
     """
 
     tips: tuple[str, ...] = ()
