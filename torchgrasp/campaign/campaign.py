@@ -43,9 +43,9 @@ class CampaignSpec(Value):
             (`torchgrasp.evaluation.EvaluationSpec`).
         licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
         jobs_in_shard: number of jobs in one file. A job is one view of one object.
-        device: "cpu", or "cuda" to plan on all views of a file at once. "cuda" needs a Dask cluster
-            whose workers have the resource "GPU". Grasps may differ from those of a CPU by
-            rounding.
+        device: "cpu", or "cuda" to plan on all views of a file at once. For "cuda" the argument
+            `workers` of `run_campaign` must be the address of a Dask scheduler. The workers of this
+            cluster must have the resource "GPU". Grasps may differ from those of a CPU by rounding.
 
     Raises `BadArgument` for:
 

@@ -66,10 +66,10 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     (`MIN_RANK_RATIO`). In addition, its contacts must not lie almost on a line, and phi must
     balance W up to rounding.
 
-    If a set is not closed, its `witness` is a unit wrench v that no contact force opposes. For
-    every edge wrench w then v . w >= 0, up to rounding. If only the rank is too low, the wrenches
-    are smallest along v. A set with a contact that is not finite is not closed. Its margin and
-    witness are NaN.
+    If a set is not closed, its `witness` is a unit wrench v that no contact force opposes. It is in
+    the frame of the contacts and scaled as w (`Certificate`). For every edge wrench w then v . w >=
+    0, up to rounding. If only the rank is too low, the wrenches are smallest along v. A set with a
+    contact that is not finite is not closed. Its margin and witness are NaN.
 
     The margin has a first derivative with respect to points and normals:
 

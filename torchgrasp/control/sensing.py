@@ -169,8 +169,8 @@ class FingertipSensor:
     """Simulator of the fingertip sensors that a `SensorModel` describes.
 
     Call it at each control tick, a period of the controller, with three arguments. They are the
-    true contacts (`TipContact`), the fingertips' Jacobian (f, 3, j) [m/rad] and the tick's length
-    [s]. It returns the readings (`TactileState`).
+    true contacts (`TipContact`), the fingertips' Jacobian (f, 3, j) [m/rad]
+    (`Observation.jacobian`), and the tick's length [s]. It returns the readings (`TactileState`).
 
     Args:
         reference: the closing plan; its `sensor` is the sensor model.

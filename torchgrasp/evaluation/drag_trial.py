@@ -70,8 +70,8 @@ class DragResult(Value):
             `DROPPED`: the object toppled, or hangs or fell over the edge.
             `SLIPPED`: the object is more than 20 mm (`DRAGS.slipped`) from its planned place.
             `START_OVERLAP` and `UNSTABLE`: as in `close_hand`.
-        motion: motion (4, 4) [m] of the object in the frame of the planned cloud, a rigid
-            transform. NaN if the status is `UNSTABLE`.
+        motion: motion (4, 4) [m] of the object from the start of the trial to its end. It is a
+            rigid transform in the frame of the planned cloud. NaN if the status is `UNSTABLE`.
         missed: distance [m] of the object's centre of mass from its planned place. NaN if the
             status is `UNSTABLE`.
         forces: sum (t,) [N] of the true normal forces of the fingertips at each control tick.

@@ -79,7 +79,7 @@ class Touch(Value):
 
     @property
     def verdicts(self) -> list[Verdict]:
-        """The verdict on each of the g grasps, the first that applies.
+        """The verdict on each of the g grasps at its planned posture, the first that applies.
 
         * "apart": a fingertip is farther than `limit` from the surface.
         * "penetrates": a fingertip is deeper in the object than `limit`.

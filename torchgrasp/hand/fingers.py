@@ -245,6 +245,7 @@ class Fingertips(Value):
         """Return (links, carriers): the poses [m] of the m links of `chains`, and of the f
         carriers, in n postures.
 
+        The carrier of a fingertip is the nearest link, its own or one above, that a joint moves.
         The shapes are (3, 4, m, n) and (3, 4, f, n): the last row of each 4 x 4 matrix is left out.
         The poses are in the palm's frame.
 

@@ -119,7 +119,7 @@ class SelfCollision(Value):
 
     @checked
     def separations(self, frames: Frames, below: Bound) -> Float[Tensor, "p n"]:
-        """Return the signed separation (p, n) [m] of each of p pairs of shapes, in each of n
+        """Return the signed separation (p, n) [m] of each of the p `pairs` of shapes, in each of n
         postures.
 
         A negative value means overlap: it is minus the shortest translation that separates the

@@ -224,9 +224,9 @@ def nearest_postures(
         contacts: b contact sets [m], with one contact for each fingertip.
         world: surroundings in the frame of the contacts.
         n_seeds: most guesses of a contact set, 1 to 64.
-        reachable: function of hand poses (k, 4, 4) [m] that returns a mask (k,) of the poses that
-            an arm reaches. The next posture takes the place of an unreachable one. None means that
-            every pose is reachable.
+        reachable: function of hand poses (k, 4, 4) [m] in the frame of the contacts. It returns a
+            mask (k,) of the poses that an arm reaches. The next posture takes the place of an
+            unreachable one. None means that every pose is reachable.
 
     Raises:
         BadArgument: `n_seeds` outside [1, 64], or above six times the number of postures in the

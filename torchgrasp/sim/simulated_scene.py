@@ -165,7 +165,7 @@ class SimulatedScene(abc.ABC):
     def drive(self, targets: np.ndarray) -> None:
         """Set the targets (j,) [rad or m] of the position control of the j driven joints.
 
-        They hold until the next call.
+        They are in the order of `joint_names`, and hold until the next call.
         """
 
     @abc.abstractmethod

@@ -168,8 +168,9 @@ class TaskWrenches(Value):
     The contacts must balance each load alone.
 
     Args:
-        wrenches: loads (w, 6) on the object in the cloud's frame. First is the force [N], in which
-            its weight is included, then the torque [N m] about `point`.
+        wrenches: loads (w, 6) on the object in the cloud's frame. First is the force [N], then the
+            torque [N m] about `point`. Include the object's weight in each load: the planner does
+            not add it.
         point: point (3,) [m] in the cloud's frame; None means the estimated centre of the object.
 
     Raises `BadArgument` for no load, or a load that is all zeros.

@@ -155,7 +155,8 @@ class ClosureResult(Value):
             closing (`phases`).
         before_lift: motion of the object in the world, from the start of the trial to the end of
             the pressing.
-        rise: height [m] by which the object's centre has risen at the end.
+        rise: height [m] by which the object's centre is higher at the end of the trial than at its
+            start.
         unbalanced: norm of the sum of the fingertip forces before the lift, over the sum of their
             norms (no unit).
         slip: motion of the object relative to the hand, from the end of the pressing to the end of

@@ -286,15 +286,17 @@ class ContactCode(Value):
     """The code q of sets of three contacts (Eq. 18 of the paper), which does not change with the
     frame.
 
-    `encode` returns it. b counts contact sets. The axis of length 6 counts the assignments of the
-    three contacts to three fingers.
+    `encode` returns it. b counts contact sets. The second axis of `q` and `obj_from_vf`, of length
+    6, counts the assignments of the three contacts to three fingers.
 
     Attributes:
-        q: code (b, 6, 6) of each set in each assignment. First are 3 distances [m] of the contacts
-            from their centroid, then 3 cosines between their normals.
+        q: code (b, 6, 6) of each set in each assignment. First are the distances [m] of the first,
+            second and third finger's contact from their centroid. Then come the cosines between the
+            normals of the first and second, first and third, second and third.
         obj_from_vf: pose (b, 6, 4, 4) [m] of the virtual frame (Eqs. 15-17) in the frame of the
             contacts. Its origin is their centroid. The axis x points from the contact of the first
-            finger to that of the third. The axis z is normal to the plane of the contacts.
+            finger to that of the third. The axis z is normal to the plane of the contacts. Seen
+            against z, the contacts of the first, second and third finger run counterclockwise.
         status: `Status` code (b,) of each set. If the contacts of a set lie on a line or in a
             point, it is not `OK`. Then `q` and `obj_from_vf` are NaN.
         permutation: indices (6, 3): in assignment k finger i touches contact `permutation[k, i]`.
