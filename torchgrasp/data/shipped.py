@@ -31,6 +31,8 @@ GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", 
 class GraspObject:
     """An object to grasp, which stands on the plane z = 0 with z up; `load_object` makes it.
 
+    Mesh, parts and view are in one frame.
+
     Attributes:
         name: name of the object.
         mesh: the true, closed surface [m].

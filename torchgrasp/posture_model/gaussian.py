@@ -179,8 +179,8 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
-        """Return the mixture over the other dimensions, given the values of some of them, Eq. (23)
-        of the paper.
+        """Return the mixture over the other dimensions, in the order of `names`, given the values
+        of some of them, Eq. (23) of the paper.
 
         Components whose weight becomes 0 are left out, except inside `torch.vmap`.
 

@@ -55,10 +55,10 @@ MeanAndSpread = tuple[Float[Tensor, "q 4"], Float[Tensor, "q k k"]]
 class ShapeGP(Posterior, Normalisation):
     """An object's shape as a Gaussian process over its signed distance, Eq. (1) of the paper.
 
-    `fit_shape` and `condition` return shapes. Points of `predict`, `contains`, `joint`, `sample`,
-    `differentiate`, `update` and `widened` are in the cloud's frame [m]. Methods that take
-    normalised points say so; `normalise` returns these. One normalised unit of length is `scale`
-    [m].
+    `fit_shape` and `condition` return shapes. Signed distances are negative inside the object and
+    positive outside. Points of `predict`, `contains`, `joint`, `sample`, `differentiate`, `update`
+    and `widened` are in the cloud's frame [m]. Methods that take normalised points say so;
+    `normalise` returns these. One normalised unit of length is `scale` [m].
 
     n counts observed points, and r observed numbers: n distances, and three for each observed
     normal.

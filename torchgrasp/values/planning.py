@@ -296,7 +296,8 @@ class ContactCode(Value):
         obj_from_vf: pose (b, 6, 4, 4) [m] of the virtual frame (Eqs. 15-17) in the frame of the
             contacts. Its origin is their centroid. The axis x points from the contact of the first
             finger to that of the third. The axis z is normal to the plane of the contacts. Seen
-            against z, the contacts of the first, second and third finger run counterclockwise.
+            from the tip of z, the contacts of the first, second and third finger run
+            counterclockwise.
         status: `Status` code (b,) of each set. If the contacts of a set lie on a line or in a
             point, it is not `OK`. Then `q` and `obj_from_vf` are NaN.
         permutation: indices (6, 3): in assignment k finger i touches contact `permutation[k, i]`.
