@@ -168,9 +168,10 @@ class DriveFeel:
 class FingertipSensor:
     """Simulator of the fingertip sensors that a `SensorModel` describes.
 
-    Call it at each control tick, a period of the controller, with three arguments. They are the
-    true contacts (`TipContact`), the fingertips' Jacobian (f, 3, j) [m/rad]
-    (`Observation.jacobian`), and the tick's length [s]. It returns the readings (`TactileState`).
+    Call it at each control tick, a period of the controller, with three arguments. The first holds
+    the true contacts (`TipContact`). The second is the fingertips' Jacobian (f, 3, j) [m/rad]
+    (`Observation.jacobian`). The third is the tick's length [s]. It returns the readings
+    (`TactileState`).
 
     Args:
         reference: the closing plan; its `sensor` is the sensor model.

@@ -82,8 +82,8 @@ class ProtocolResult(Value):
       the true surface.
     * "too weak": the drives were at their limits, or the hand felt a load that it cannot hold. The
       size is the largest normal force [N] of a finger before the lift.
-    * "dropped when pushed": the lifted object was lost under the push of `TrialSpec.push`. The size
-      is the force [N] of the push.
+    * "dropped when pushed": the lifted object was lost under the push of the trial
+      (`TrialSpec.push` or `Protocol.push`). The size is the force [N] of the push.
     * "turned": the object turned in the closed hand by more than 30 degrees, before it slid. The
       size is its largest rotation [deg].
     * "slid": the object slid in the closed hand, or hung on one finger. The size is its largest

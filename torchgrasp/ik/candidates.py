@@ -73,7 +73,7 @@ class GraspProblem(Value):
         world: the surroundings of the hand, with one object for all contact sets, or one for each.
         center: the object's centre (3,) [m] in the object's frame, or one for each contact set (b,
             3). Grasps whose contacts have a centroid near it get a higher score.
-        reachable: function of hand poses (k, 4, 4) [m] in the object's frame that returns a mask
+        reachable: function of hand poses (k, 4, 4) [m] in the object's frame. It returns a mask
             (k,) of the poses that an arm reaches. None means that every pose is reachable.
         descends: whether the opened hand may start above the pose of the grasp. It does so if its
             opened fingers would be in the table (`opened_pose`). It then goes down while it closes.

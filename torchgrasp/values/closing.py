@@ -151,7 +151,7 @@ class ClosureResult(Value):
         contact_order: indices of the fingers that touched, in the order of their first contacts.
         object_motion: motion of the object relative to the hand, from the end of the approach to
             the end of the trial.
-        pushed: motion of the object in the world, from the end of the approach to the end of the
+        pushed: motion of the object in the world, from the end of the approach to that of the
             closing (`phases`).
         before_lift: motion of the object in the world, from the start of the trial to the end of
             the pressing.
