@@ -44,6 +44,7 @@ def run() -> Run:
     status = torch.tensor([Status.OK, Status.TIP_ERROR])
     meta = {
         "hand": "allegro",
+        "hand_sha256": hand.source.sha256,
         "seed": "7",
         "units": "metre, radian",
         "note": "<script>alert(1)</script>",
