@@ -231,10 +231,12 @@ def cloud_from_array(
             columns. The last three are normals if they have length 1 and fit the surface. Otherwise
             they are taken for colours and left out.
         normals: outward normals in the shape of `points`; None without normals.
-        viewpoint: position (3,) [m] of the camera, in the frame of the points. Or the positions of
-            each point's camera, in the shape of (n, 3) points. None if it is unknown.
+        viewpoint: position (3,) [m] of the camera, in the frame of the points. For several cameras,
+            one position for each point: an array (n, 3), or (h, w, 3) for an image. None if it is
+            unknown.
 
-    Raises the errors of `check_cloud`, and `CloudFileError` for arrays of another shape or type.
+    Raises the errors of `check_cloud`, such as `TooFewPoints` and `SuspiciousScale`. Raises
+    `CloudFileError` for arrays of another shape or type.
 
     >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))
     48

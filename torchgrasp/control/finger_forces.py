@@ -43,8 +43,10 @@ class PreferredForces(Value):
 
 @runtime_checkable
 class ForcePreference(Protocol):
-    """A model that chooses among balanced forces of nearly equal friction, such as a model of
-    stability.
+    """A model of preferred finger forces, such as a model of stability.
+
+    Of balanced forces that need almost the least friction, those nearest to its preference are
+    taken.
     """
 
     def preferred_forces(

@@ -390,14 +390,15 @@ class Reopening:
 class LiftCheck:
     """Check whether a closed hand that rises loses the object.
 
-    Call it at the end of each tick of the lift, a period of the controller; it returns `lost`. It
-    takes three arguments. The first is an `Observation`. The second is the height [m] of the hand
-    above its place at the start of the lift. The third is the tick's length [s].
+    A tick is one period of the controller. Call the check at the end of each tick of the lift; the
+    call returns `lost`. It takes three arguments. The first is an `Observation`. The second is the
+    height [m] of the hand above its place at the start of the lift. The third is the tick's length
+    [s].
 
     `lost` becomes true, and stays so, at the first of two events (bounds: `LOST`):
 
-    * The hand has risen by at least 10 mm, and fewer than two fingertips touch. In addition, all
-      fingertips together carry a low-passed load of less than 0.2 N along the table's normal.
+    * The hand has risen by at least 10 mm, and two things hold together. Fewer than two fingertips
+      touch. All fingertips together carry a low-passed load below 0.2 N along the table's normal.
     * Two fingertips have each slid by more than 1.5 mm in total, before the hand was 20 mm high.
 
     Without a table, or with binary sensors, the load is unknown and counts as 0. Fingertips with

@@ -359,10 +359,13 @@ def closing_gains(
         grasp: a single grasp, such as `grasps[0]`.
         hand: the hand of the grasp.
         force: normal force [N] of the strongest finger.
-        stability: model that chooses among balanced forces of nearly equal friction
-            (`torchgrasp.control.paper.stability.load_stability`); None means no model.
+        stability: model of which forces of three fingers hold an object stably
+            (`torchgrasp.control.paper.stability.load_stability`). Of balanced forces that need
+            almost the least friction, those nearest to its preference are taken. None means that
+            equal normal forces are preferred.
 
-    Raises the errors of `ClosingReference.from_grasp`.
+    Raises `BadArgument` for more than one grasp, a grasp of another hand, contacts without `std_m`,
+    or a `force` out of range. `ClosingReference.from_grasp` lists all cases.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -135,10 +135,10 @@ class ViewScore(Value):
             not end.
         attempts: results of the trials, one for each tried grasp and each random pose error. A pose
             error displaces the hand or the object in a trial (`PoseNoise`).
-        refusal: `OK` if a grasp is executable; else the most frequent failure of the plan. It is
-            `BAD_OBJECT` for bad files or a failed plan. It is `TIMED_OUT` or `WORKER_DIED` if
-            planning did not end. It is `OUT_OF_REACH` if neither the plan nor its file names a
-            failure.
+        refusal: `OK` if a grasp is executable. If planning ended without one, it is the most
+            frequent failure of its candidates, or `OUT_OF_REACH` if no failure is recorded. It is
+            `BAD_OBJECT` if a file is bad, or planning raised an error. It is `TIMED_OUT` or
+            `WORKER_DIED` if planning did not end.
         note: details of the refusal, or "".
         family: name of a family of similar objects, or "".
         group: group of the object, such as "solid", or "".

@@ -32,9 +32,10 @@ class ArmMotion(Value):
         joint_names: names of the j joints: first the arm's, then all movable joints of the hand.
         times: times (t,) [s] from the start, beginning at 0.
         positions: target positions (g, t, j) [rad, or m for sliding joints] of these joints.
-        phases: index into `times` of each named moment. At "above" the opened hand is before its
-            pre-grasp, and at "pregrasp" it has arrived. At "grasp" the fingers are on the contacts,
-            and at "squeeze" their targets press. At "lift" the hand has lifted the object.
+        phases: index into `times` of each named moment. At "above", the start, the opened hand is
+            0.1 m away from its pre-grasp pose. At "pregrasp" it has reached that pose. At "grasp"
+            the fingers are on the contacts. At "squeeze" the joint targets lie beyond them, so that
+            the fingers press. At "lift" the hand has lifted the object by 0.1 m.
     """
 
     joint_names: tuple[str, ...]

@@ -242,12 +242,12 @@ class Fingertips(Value):
 
     @checked(gradients=True)
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Frames, Float[Tensor, "3 4 f n"]]:
-        """Return (links, carriers): the poses [m] of the m links of `chains`, and of the f
-        carriers, in n postures.
+        """Return (links, carriers): poses [m] in the palm's frame, in n postures.
 
-        The carrier of a fingertip is the nearest link, its own or one above, that a joint moves.
-        The shapes are (3, 4, m, n) and (3, 4, f, n): the last row of each 4 x 4 matrix is left out.
-        The poses are in the palm's frame.
+        `links` (3, 4, m, n) are those of the m links that lead to the carriers
+        (`chains.link_names`). `carriers` (3, 4, f, n) are those of the f carriers. A fingertip's
+        carrier is the last link, up to its own, that a joint moves. The last row of each 4 x 4
+        matrix is left out.
 
         Args:
             values: positions (j, n) [rad or m] of all j movable joints of the URDF, in the order of

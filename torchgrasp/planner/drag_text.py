@@ -61,10 +61,11 @@ def with_drag(grasps: Grasps, drag: DragPlan) -> Grasps:
 
 @checked
 def drag_of(grasps: Grasps) -> DragPlan | None:
-    """Return the drag that comes before grasps at the edge of a table; None if there is none.
+    """Return how the hand drags the object to the table's edge, before it grasps it there.
 
-    The drag is stored in `Grasps.meta`, as by `plan_edge_grasps` and `torchgrasp grasp --edge`.
-    Numbers are in float64. Raises `BadArgument` for a malformed drag.
+    The result is the `DragPlan` that `plan_edge_grasps` and `torchgrasp grasp --edge` store in
+    `Grasps.meta`. It is None if the grasps need no drag. Its tensors are in float64. Raises
+    `BadArgument` for a malformed drag.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> drag_of(load_shipped_grasp("jug", "allegro")) is None

@@ -574,7 +574,10 @@ class Scene(Value):
 
     @checked
     def cloud(self, label: int | None = None) -> PointCloud:
-        """Return the points [m] of one object in the frame "obj", with the camera as viewpoint.
+        """Return the points (n, 3) [m] of one object, with the camera as viewpoint.
+
+        They are in the scene's frame, in which the camera has the pose `image.obj_from_camera`. All
+        objects of the scene share this frame.
 
         Args:
             label: the object's label; None means the target.

@@ -105,10 +105,12 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (q, 2): which surface, outer or inner, applies at each of q normalised
-        points `x` (q, 3).
+        """Return which surface determines the signed distance at each of q points `x` (q, 3) that
+        `normalise` returned.
 
-        That is the surface with the greater mean signed distance. Each row has one True.
+        The result is a mask (q, 2) with the columns outer and inner. Each row has one True: the
+        surface with the greater mean signed distance. The outer distance is positive outside the
+        vessel, and the inner one in its cavity. So the greater of both is that of the material.
         """
         inner = self.inner.mean(x) > self.outer.mean(x)
         return torch.stack([~inner, inner], 1)
