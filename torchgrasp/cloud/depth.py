@@ -260,12 +260,6 @@ def _in_metres(image: Tensor, unit: float | None) -> Image:
             found = f"{share:.0%} of the depths are exactly 1, and none is larger"
             fix = "if it is a z-buffer, or depth scaled to 0..1, give metres"
             warn_user(CloudWarning, f"depth: {found}: {fix}")
-    step = _step_of(measured)
-    if step >= DEPTH.coarse:
-        found = (
-            f"depth: its steps are {1e3 * step:.3g} mm, in which edges and small things are lost"
-        )
-        warn_user(CloudWarning, f"{found}; save more digits, such as 16-bit millimetres")
     near = measured[measured <= DEPTH.farthest]
     # Renderers write one large number, such as 1e10, where they see nothing.
     background = measured == measured.max() if len(near) else measured > math.inf
@@ -285,6 +279,12 @@ def _in_metres(image: Tensor, unit: float | None) -> Image:
         found = f"{float(near.median()):.3g} m; how many metres is a count? Give depth_unit"
         allowed = f"a median depth of at least {DEPTH.nearest:g} metres"
         raise BadArgument("depth", found, allowed)
+    step = _step_of(near)
+    if step >= DEPTH.coarse:
+        found = (
+            f"depth: its steps are {1e3 * step:.3g} mm, in which edges and small things are lost"
+        )
+        warn_user(CloudWarning, f"{found}; save more digits, such as 16-bit millimetres")
     return torch.where(metres <= DEPTH.farthest, metres, 0.0)
 
 
