@@ -141,7 +141,7 @@ def cloud_from_depth(
         view = apply(pose, _points(z_image, k, seen, lens))
         view = view[:: 1 + len(view) // DEPTH.viewed]
         check_view(view, pose.cpu(), up, depth_unit is not None)
-    for note in tell_far(pose):
+    for note in (*tell_far(pose), *tell_step(z_image)):
         warn_user(CloudWarning, note)
 
     viewpoint = pose[:3, 3]
@@ -279,13 +279,19 @@ def _in_metres(image: Tensor, unit: float | None) -> Image:
         found = f"{float(near.median()):.3g} m; how many metres is a count? Give depth_unit"
         allowed = f"a median depth of at least {DEPTH.nearest:g} metres"
         raise BadArgument("depth", found, allowed)
-    step = _step_of(near)
-    if step >= DEPTH.coarse:
-        found = (
-            f"depth: its steps are {1e3 * step:.3g} mm, in which edges and small things are lost"
-        )
-        warn_user(CloudWarning, f"{found}; save more digits, such as 16-bit millimetres")
     return torch.where(metres <= DEPTH.farthest, metres, 0.0)
+
+
+def tell_step(depth: Image) -> tuple[str, ...]:
+    """Return one note if all depths [m] of an image are whole numbers of a large step, else none.
+
+    Depths of 0 are not measured.
+    """
+    step = _step_of(depth[depth > 0])
+    if step < DEPTH.coarse:
+        return ()
+    found = f"depth: its steps are {1e3 * step:.3g} mm, in which edges and small things are lost"
+    return (f"{found}; save more digits, such as 16-bit millimetres",)
 
 
 def _step_of(measured: Float[Tensor, "n"]) -> float:

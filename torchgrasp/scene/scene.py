@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.cloud.depth import tell_step
 from torchgrasp.cloud.pose import (
     check_sizes,
     find_plausible,
@@ -220,6 +221,7 @@ class Scene(Value):
             notes += (LOCAL, *tell_rays(image))
         if table is None and up is None:
             notes += tell_tilt(image.obj_from_camera, supports[0].plane)
+        notes += tell_step(image.depth)
         notes += tell_leaning(
             points[measured],
             found[measured],
