@@ -235,11 +235,10 @@ class Distribution(Value):
 
     @checked(gradients=True)
     def cdf(self, x: Annotated[Float[Tensor, "*b"], ANY]) -> Float[Tensor, "*b"]:
-        """Return the probability (*b,) that the number is at most `x` (*b,), in the unit of the
-        number; NaN for NaN.
+        """Return the probability (*b,) that the number is at most `x` (*b,); NaN for NaN.
 
-        The result is differentiable in `x`. The derivative is the density of the intervals; it does
-        not show the jumps at single numbers.
+        `x` is in the unit of the number. The result is differentiable in `x`. The derivative is the
+        density of the intervals; it does not show the jumps at single numbers.
         """
         return torch.where(x.isnan(), x, self._below(x, reached=True).clamp(0, 1))
 
@@ -329,7 +328,7 @@ class Distribution(Value):
         A part that is a single number is one node. An interval is cut into equal pieces, and their
         middles are the nodes. The greater an interval's probability, the more pieces it has. If the
         distribution has more `parts` than `count`, the nodes are the `count` quantiles (i + 1/2) /
-        `count`.
+        `count`, each with the probability 1 / `count`.
 
         Raises `BadArgument` for a `count` out of range.
 
