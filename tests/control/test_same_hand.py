@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from torchgrasp import load_hand
 from torchgrasp.control.finger_forces import squeeze
@@ -45,4 +46,5 @@ def test_another_stiffness_and_a_change_below_the_bound_are_no_other_geometry(tm
     finer = load_hand(changed(tmp_path / "finer", "hand.urdf", TIP, rounded))
     for hand in (softer, finer):
         assert hand.source.sha256 != grasp.meta["hand_sha256"]
-        assert ClosingReference.from_grasp(hand, grasp).hand is not None
+        reference = ClosingReference.from_grasp(hand, grasp)
+        assert torch.equal(reference.joints, grasp.joints[0].double())

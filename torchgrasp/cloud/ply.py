@@ -39,8 +39,7 @@ def parse_ply(data: bytes) -> dict[str, Any]:
 
     They are "points" and "normals" (n, 3), "viewpoint" (3,), "frustum" (4, 3) and "table" (4,),
     where the file has them. "said" lists comments on a unit or a scale, which are not applied. A
-    mesh gives points on its surface. Raises `Malformed` for a malformed
-    file.
+    mesh gives points on its surface. Raises `Malformed` for a malformed file.
     """
     header, body = _split_header(data)
     encoding = ""

@@ -145,12 +145,12 @@ def prepare_cloud(
     are removed, and the other points are moved onto quadrics fitted around them. All normals are
     fitted anew. Also with `clean`, a viewpoint that too few given normals face counts as missing.
     If these are the normals of one side, `NoEffect` warns of it. Vectors across the surface, which
-    are no normals, raise a `CloudWarning`. With `clean`, a missing viewpoint
-    is that of `find_pixel_camera`, if its pixels show it. `up` is the upward direction, or None.
-    Else, and where normals are fitted, it is estimated by `guess_viewpoint`. `neighbours` are those
-    of the points in float64, if they are known. Raises the errors of `check_cloud`. Raises
-    `BadArgument` for more than 16 cameras or normals that point away from the camera. Raises
-    `TooFewPoints` for a view of fewer than 10 points.
+    are no normals, raise a `CloudWarning`. With `clean`, a missing viewpoint is that of
+    `find_pixel_camera`, if its pixels show it. Else, and where normals are fitted, it is estimated
+    by `guess_viewpoint`. `up` is the upward direction, or None. `neighbours` are those of the
+    points in float64, if they are known. Raises the errors of `check_cloud`. Raises `BadArgument`
+    for more than 16 cameras or normals that point away from the camera. Raises `TooFewPoints` for a
+    view of fewer than 10 points.
     """
     distinct = remove_duplicates(cloud)
     if neighbours is None or len(distinct) < len(cloud):
@@ -314,7 +314,7 @@ def lie_across(points: Points, normals: Points) -> bool:
     rows = draw_rows(len(points), NORMALS.drawn).to(points.device)
     planes, _ = fit_local_planes(points, rows)
     given = unit_of_any(normals[rows])
-    cosine = (planes * given).sum(-1).abs()
+    cosine = dot(planes, given).abs()
     usual = unit_of_any(given.median(0).values)
     alike = float(((given @ usual) > NORMALS.alike).double().mean()) >= NORMALS.nearly
     # most points of one colour may lie on the one face of which it is the normal

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.linalg import Points, across
+from torchgrasp.geometry.linalg import Points, across, dot
 from torchgrasp.geometry.plane import Plane
 
 
@@ -89,7 +89,7 @@ def _share_around_some(points: Points, normals: Points) -> float:
     """
     rows = draw_rows(len(points), SURROUNDINGS.planes)
     normal = normals[rows]  # (m, 3)
-    height = points @ normal.T - (normal * points[rows]).sum(-1)  # (n, m)
+    height = points @ normal.T - dot(normal, points[rows])  # (n, m)
     # nothing is seen below a table: this leaves out the sides of objects
     allowed = _share_below(height) <= SURROUNDINGS.below
     count = torch.where(allowed, (height.abs() < SURROUNDINGS.layer).sum(0), 0)

@@ -73,11 +73,11 @@ GRIPPER_KNOWN = ("object_ID", "test_type", "controller", "test_duration", "physi
 GRIPPER_TIMES = ("result_time", "runtime", "timestamp")  # known, too
 # arrays of a DexGraspBench file: read, and those that we know and need not
 BENCH_READ = ("grasp_qpos", "pregrasp_qpos", "obj_pose")
-BENCH_KNOWN = ("obj_path", "obj_scale", "squeeze_qpos", "joint_names")
+BENCH_NAMES = "joint_names"  # array with the names of the joints in the order of a posture
+BENCH_KNOWN = ("obj_path", "obj_scale", "squeeze_qpos", BENCH_NAMES)
 BENCH_FILE = "an .npz of at most 512 MiB with 'grasp_qpos'"
 MOST_JOINTS = 100  # most names of joints that are read
 MOST_SHOWN = 200  # letters of these names in an error
-BENCH_NAMES = "joint_names"  # array with the names of the joints in the order of a posture
 _refuse = functools.partial(ModelFileError, "path")  # the error of a bad file of grasps
 Quaternion = Literal["wxyz", "xyzw"]
 

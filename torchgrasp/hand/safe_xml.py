@@ -158,7 +158,7 @@ def soft_limits(data: bytes) -> dict[str, tuple[float, float]]:
 
     `data` are the bytes of a file that `parse_urdf` took.
     """
-    robot = ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
+    robot = bounded_tree(data)
     found = {}
     for joint in robot.findall("joint"):
         safety = joint.find("safety_controller")

@@ -140,7 +140,7 @@ class ShapedObject:
         obstacles = None
         vague = is_vague_cloud(cloud)
         if scene is None:
-            vague = vague or _is_surrounded(shape, None if spec.table is None else 0.0)
+            vague = vague or _is_surrounded(shape, spec.table is not None)
         else:
             vague = vague or bool(scene.covers) or bool(scene.doubts)
             scene = scene.to_upright(frame)
@@ -494,14 +494,14 @@ def is_vague_cloud(cloud: PointCloud) -> bool:
     return cut or len(cloud) < FEW_POINTS or is_flat(cloud.points)
 
 
-def _is_surrounded(shape: ShapeGP, table: float | None) -> bool:
-    """Return whether points of a table, at a height [m] or unknown, surround the object of a
-    shape.
+def _is_surrounded(shape: ShapeGP, on_table: bool) -> bool:
+    """Return whether points of a table surround the object of a shape. `on_table` is whether the
+    table is known: it is then at z = 0.
     """
     cloud = shape.cloud
     if cloud.normals is None:
         return False
-    plane = None if table is None else Plane.horizontal(table)
+    plane = Plane.horizontal(0.0) if on_table else None
     return find_surroundings(cloud.points, cloud.normals, plane) > 0
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows, fit_local_planes
 from torchgrasp.cloud.pose import Transform
+from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.geometry.linalg import Points, Vector, dot, norm, unit
 from torchgrasp.geometry.plane import Plane
 
@@ -66,7 +67,7 @@ def tell_leaning(
     eye = pose[:3, 3].double().cpu()
     forward = pose[:3, 2].double().cpu()
     table = table.to("cpu", torch.float64)
-    labelled = torch.nonzero(labels)[:, 0]
+    labelled = flatnonzero(labels > 0)
     own = labels[labelled]
     count = torch.bincount(own)
     largest = count.argsort(descending=True)[: LEANING.objects]
