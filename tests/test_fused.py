@@ -21,7 +21,7 @@ from torchgrasp import (
     plan_grasps,
     stream_grasps,
 )
-from torchgrasp.contacts.form_closure import maximise
+from torchgrasp.contacts.form_closure import closed_exact, maximise
 from torchgrasp.contacts.problem import ContactProblem
 from torchgrasp.contacts.solver import Stage, descend, project, start_state
 from torchgrasp.foundation import fused
@@ -167,6 +167,22 @@ def test_scores_of_mirror_planes_and_the_space_beside_an_outline(both):
         wanted, found = both(lambda look=look: look(points))
         assert (wanted > 0).any() and not (wanted > 0).all()
         assert_close(found, wanted)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])
+def test_form_closure_of_three_contacts(both, friction):
+    """Some sets are closed; contacts may coincide, lie on a line, or not be numbers."""
+    points = random(120, 3, 3)
+    normals = unit(unit(points) + 0.3 * random(120, 3, 3, seed=1))
+    points[0] = 0.0
+    points[1, 1] = points[1, 0]
+    points[2] = points[2, :1] * torch.tensor([[1.0], [2.0], [3.0]])
+    points[3, 0, 0] = torch.nan
+    normals[4, 2, 1] = torch.nan
+    wanted, found = both(lambda: closed_exact(points, normals, friction))
+    assert torch.equal(found, wanted)
+    assert not wanted[:5].any()
+    assert wanted.any() or friction == 0.0
 
 
 @pytest.mark.parametrize("criterion", ["variance", "error", "both"])

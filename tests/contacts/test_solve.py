@@ -11,12 +11,13 @@ import torch
 from tests.make import near, real, spokes
 from torchgrasp import ContactSpec, certify
 from torchgrasp.contacts.feasibility import check_feasibility, first_violation, normal_variation
-from torchgrasp.contacts.form_closure import wrenches
+from torchgrasp.contacts.form_closure import closed_exact, wrenches
 from torchgrasp.contacts.plan import TO_CENTRE, plan_chunk, plan_contacts
 from torchgrasp.contacts.problem import ContactProblem
 from torchgrasp.contacts.solver import project
 from torchgrasp.contacts.starts import (
     STARTS_PER_CHUNK,
+    candidate_rows,
     draw_in,
     drawn_starts,
     settle_flatness,
@@ -185,6 +186,36 @@ def test_contacts_of_a_ball_are_flat_within_the_widest_ring_that_it_offers(ellip
     given = dataclasses.replace(spec, flat_radius=0.002)
     assert settle_flatness(ball, given, 0).spec == given
     assert settle_flatness(ball, ContactSpec.paper(), 0) == (ContactSpec.paper(), None)
+
+
+@pytest.mark.parametrize("fingertips", [3, 4])
+def test_starts_are_the_first_good_ones_of_all_that_are_drawn(ellipsoid, monkeypatch, fingertips):
+    """Portions change nothing; starts that are missing are any candidates."""
+    spec = dataclasses.replace(SPECS["table"], fingertips=fingertips)
+    settled = settle_flatness(ellipsoid, spec, 0)
+    problem = ContactProblem.of(ellipsoid, settled.spec)
+    points, normals = settled.candidates
+
+    def drawn(portion: int, apart: float) -> torch.Tensor:
+        monkeypatch.setattr("torchgrasp.contacts.starts.LEAST_PORTION", portion)
+        far = dataclasses.replace(problem, separation=apart)
+        generator = torch.Generator().manual_seed(2)
+        rows = candidate_rows(far, points, normals, 12, generator)
+        # the generator goes on from the same state
+        return torch.cat([rows.flatten(), torch.rand(2, generator=generator).double()])
+
+    for apart in (problem.separation, 10.0):
+        assert torch.equal(drawn(1, apart), drawn(10_000, apart))
+    generator = torch.Generator().manual_seed(2)
+    size = 20 * 12, fingertips
+    choice = torch.cat([torch.randint(len(points), size, generator=generator) for _ in range(8)])
+    centres = points[choice] + problem.tip_radius * normals[choice]
+    sides = torch.stack([torch.pdist(centre).min() for centre in centres])
+    closed = closed_exact(points[choice], normals[choice], problem.friction)
+    wanted = choice[closed & (sides > problem.separation)][:12]
+    assert len(wanted) >= 5
+    first = points[wanted].flatten()
+    assert torch.equal(drawn(1, problem.separation)[: len(first)], first)
 
 
 def test_contacts_on_opposite_sides_of_a_thin_thing_may_be_as_near_as_it_is_thin(ellipsoid):

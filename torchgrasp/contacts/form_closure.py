@@ -299,8 +299,12 @@ def closed_exact(
     contacts, which save time.
     """
     if points.shape[1] == 3:
-        return _closed_in_plane(points, normals, friction) & ~degenerate(points)
-    return _closed_by_proof(points, normals, friction, guess) & ~degenerate(points)
+        closed = _closed_in_plane(points, normals, friction)
+    else:
+        closed = _closed_by_proof(points, normals, friction, guess)
+    rows = flatnonzero(closed)
+    closed[rows] = ~degenerate(points[rows])
+    return closed
 
 
 def first_balance(points: Vectors, normals: Vectors, friction: float) -> Coefficients:
@@ -326,6 +330,10 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
     these angles must positively span all planar wrenches. So no plane through two of the wrenches
     has the others on one side.
     """
+    if is_fused(points, normals):
+        from torchgrasp.contacts import fused_plane  # it imports numba
+
+        return fused_plane.closed_in_plane(points, normals, friction, PARALLEL)
     arm = scaled_arms(points)
     first, second, third = arm.unbind(1)
     across = unit(torch.linalg.cross(second - first, third - first))

@@ -5,6 +5,7 @@ f counts the contacts of a set.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
@@ -30,6 +31,7 @@ NEAR_CENTRE = 0.1
 # rows drawn for each start in one round, and most rounds: few rows are closed
 DRAWN_PER_START = 20
 ROUNDS = 8
+LEAST_PORTION = 500  # sets judged at once: fewer take as long, as each operation has its cost
 # share of starts, and of how many, that must be closed: contacts can be so flat
 ENOUGH_CLOSED = 0.1
 SURVEYED = 250
@@ -109,7 +111,7 @@ def drawn_starts(
             drawn = draw(shape, spec, (count, spec.fingertips), generator)
             yield project(shape, draw_in(shape, drawn), steps=6)
         else:
-            yield candidate_rows(problem, *candidates, count, generator)[0]
+            yield candidate_rows(problem, *candidates, count, generator)
 
 
 def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandidates:
@@ -134,8 +136,9 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
         flat = variation < CANDIDATE_FLATNESS * spec.flatness
         if int(flat.sum()) >= spec.fingertips and radius not in (spec.flat_radius, FLAT_RADII[-1]):
             generator = torch.Generator().manual_seed(seed)
-            _, closed = candidate_rows(problem, points[flat], normals[flat], SURVEYED, generator)
-            if closed >= ENOUGH_CLOSED * SURVEYED:
+            closed = good_sets(problem, points[flat], normals[flat], SURVEYED, generator)
+            counts = itertools.accumulate(len(sets) for sets in closed)
+            if any(count >= ENOUGH_CLOSED * SURVEYED for count in counts):
                 break
     if int(flat.sum()) < spec.fingertips:
         flat = torch.ones_like(flat)
@@ -216,31 +219,49 @@ def candidate_rows(
     normals: Points,
     starts: int,
     generator: torch.Generator,
-) -> tuple[Vectors, int]:
-    """Return random sets (b, f, 3) of candidate contacts, and how many of them are good.
+) -> Vectors:
+    """Return random sets (b, f, 3) of candidate contacts, most of which are good.
 
-    Good sets have force closure, and contacts far enough from each other, as `problem` demands.
-    `points` (p, 3) are the normalised candidates, `normals` (p, 3) their outward unit normals, and
-    `starts` is the number b of sets. If too few of the drawn sets are good, the rest are any
-    candidates. `generator` draws the sets.
+    The arguments are those of `good_sets`, and `starts` is the number b of sets. If too few of the
+    drawn sets are good, the rest are any candidates.
     """
     rows = []
     missing = starts
-    f = problem.spec.fingertips
-
-    def choose(sets: int) -> Int[Tensor, "s f"]:
-        drawn = torch.randint(len(points), (sets, f), generator=generator, device="cpu")
-        return drawn.to(points.device)
-
-    for _ in range(ROUNDS):
-        choice = choose(DRAWN_PER_START * starts)
-        apart = norm(problem.sides(points[choice], normals[choice])).amin(-1)
-        choice = choice[apart > problem.separation]
-        closed = closed_exact(points[choice], normals[choice], problem.friction)
-        kept = choice[closed][:missing]
-        rows.append(points[kept])
-        missing -= len(kept)
+    for good in good_sets(problem, points, normals, starts, generator):
+        rows.append(points[good[:missing]])
+        missing -= len(rows[-1])
         if missing == 0:
             break
-    rows.append(points[choose(missing)])
-    return torch.cat(rows), starts - missing
+    others = draw_sets(len(points), missing, problem.spec.fingertips, generator)
+    return torch.cat([*rows, points[others.to(points.device)]])
+
+
+def good_sets(
+    problem: ContactProblem,
+    points: Points,
+    normals: Points,
+    starts: int,
+    generator: torch.Generator,
+) -> Iterator[Int[Tensor, "_ f"]]:
+    """Yield random sets of candidates, given by their indices, in portions that are judged when
+    they are asked for.
+
+    Good sets have force closure, and contacts far enough from each other, as `problem` demands.
+    `points` (p, 3) are the normalised candidates, `normals` (p, 3) their outward unit normals.
+    `generator` draws some sets for each of the `starts` in each of a few rounds.
+    """
+    for _ in range(ROUNDS):
+        drawn = draw_sets(len(points), DRAWN_PER_START * starts, problem.spec.fingertips, generator)
+        # a GPU would wait for each portion
+        portion = max(starts, LEAST_PORTION) if points.device.type == "cpu" else len(drawn)
+        for choice in drawn.to(points.device).split(portion):
+            apart = norm(problem.sides(points[choice], normals[choice])).amin(-1)
+            choice = choice[apart > problem.separation]
+            yield choice[closed_exact(points[choice], normals[choice], problem.friction)]
+
+
+def draw_sets(
+    candidates: int, sets: int, fingertips: int, generator: torch.Generator
+) -> Int[Tensor, "s f"]:
+    """Return random indices of candidates on the CPU, one for each fingertip of each set."""
+    return torch.randint(candidates, (sets, fingertips), generator=generator, device="cpu")

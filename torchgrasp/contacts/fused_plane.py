@@ -1,0 +1,101 @@
+"""The test of three contacts in their plane, of `torchgrasp.contacts.form_closure.closed_exact`, as
+one compiled loop over contact sets.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.foundation.fused import array, compiled, inlined
+from torchgrasp.geometry.fused_vectors import add, cross, dot, minus, scale
+
+
+@inlined
+def _unit(v):
+    """Return a vector divided by its length."""
+    return scale(v, 1.0 / math.sqrt(dot(v, v)))
+
+
+@inlined
+def _cut(planar, points, normals, cone):
+    """Write the six planar wrenches along the sides of the friction cones.
+
+    Return whether the plane of the contacts cuts all cones. `cone` is the cosine of the angle
+    between a cone's axis and its surface.
+    """
+    centre = scale(add(add(points[0], points[1], 1.0), points[2], 1.0), 1.0 / 3.0)
+    square = 0.0
+    for c in range(3):
+        arm = minus(points[c], centre)
+        square += dot(arm, arm)
+    shrink = 1.0 / math.sqrt(square / 3.0)  # torques have no unit
+    along = _unit(minus(points[1], points[0]))
+    across = _unit(cross(along, minus(points[2], points[0])))
+    other = cross(across, along)
+    for c in range(3):
+        arm = minus(points[c], centre)
+        x = shrink * dot(arm, along)
+        y = shrink * dot(arm, other)
+        inward_x = -dot(normals[c], along)
+        inward_y = -dot(normals[c], other)
+        projected = math.sqrt(inward_x * inward_x + inward_y * inward_y)
+        if not projected > cone:
+            return False
+        half = math.acos(cone / projected)
+        middle = math.atan2(inward_y, inward_x)
+        for side in range(2):
+            angle = middle - half if side == 0 else middle + half
+            cosine = math.cos(angle)
+            sine = math.sin(angle)
+            planar[2 * c + side, 0] = cosine
+            planar[2 * c + side, 1] = sine
+            planar[2 * c + side, 2] = x * sine - y * cosine
+    return True
+
+
+@inlined
+def _spans(planar, parallel):
+    """Return whether six planar wrenches positively span all planar wrenches.
+
+    No plane through two of them may have the others on one side.
+    """
+    spans = False
+    for i in range(6):
+        for j in range(i + 1, 6):
+            plane = cross(planar[i], planar[j])
+            if math.sqrt(dot(plane, plane)) > parallel:
+                spans = True
+                least = 0.0
+                most = 0.0
+                for k in range(6):
+                    side = dot(plane, planar[k])
+                    least = min(least, side)
+                    most = max(most, side)
+                if not (most > parallel and least < -parallel):
+                    return False
+    return spans
+
+
+@compiled
+def _put_closed(points, normals, cone, parallel, closed):
+    """Write for each contact set whether it has force closure."""
+    planar = np.empty((6, 3))
+    for g in range(len(points)):
+        closed[g] = _cut(planar, points[g], normals[g], cone) and _spans(planar, parallel)
+
+
+def closed_in_plane(
+    points: Float[Tensor, "b 3 3"],
+    normals: Float[Tensor, "b 3 3"],
+    friction: float,
+    parallel: float,
+) -> Bool[Tensor, "b"]:
+    """Return the results of `_closed_in_plane` of `form_closure`. Planar wrenches with a cross
+    product shorter than `parallel` are parallel.
+    """
+    closed = points.new_zeros(len(points)).bool()
+    cone = math.cos(math.atan(friction))
+    _put_closed(array(points), array(normals), cone, parallel, closed.numpy())
+    return closed
