@@ -7,6 +7,7 @@ import importlib
 import math
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -26,7 +27,7 @@ from torchgrasp.contacts.problem import ContactProblem
 from torchgrasp.contacts.solver import Stage, descend, project, start_state
 from torchgrasp.foundation import fused
 from torchgrasp.foundation.base import Value, named_tensors
-from torchgrasp.foundation.errors import IndefiniteCovariance, MissingExtra
+from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance, MissingExtra
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import farthest_points, unit
 from torchgrasp.geometry.mesh_distance import MeshSurface
@@ -55,7 +56,7 @@ def both(monkeypatch):
     monkeypatch.setattr(fused, "has_numba", lambda: True)
 
     def compute(function):
-        monkeypatch.delenv(fused.VARIABLE, raising=False)
+        monkeypatch.setenv(fused.VARIABLE, "0")
         first = function()
         monkeypatch.setenv(fused.VARIABLE, "1")
         return first, function()
@@ -336,10 +337,28 @@ def test_plans_with_and_without_loops(both):
     torch.testing.assert_close(found.joints, wanted.joints, rtol=0, atol=1e-4)
 
 
-def test_loops_are_asked_for_and_take_plain_float64_alone(monkeypatch):
+def test_loops_are_on_where_numba_is_installed_and_new_enough(monkeypatch):
+    """One that another package brought may be broken, or too old."""
     x = torch.zeros(2, dtype=torch.float64)
     monkeypatch.delenv(fused.VARIABLE, raising=False)
+    for short, on in (((0, 61), True), ((1, 0), True), ((0, 60), False), (None, False)):
+        found = SimpleNamespace(version_info=SimpleNamespace(short=short)) if short else None
+        monkeypatch.setitem(sys.modules, "numba", found)
+        fused.can_compile.cache_clear()
+        assert fused.is_fused(x) == on
+    fused.can_compile.cache_clear()
+    monkeypatch.setattr(fused, "can_compile", lambda: True)
+    monkeypatch.setenv(fused.VARIABLE, "0")
     assert not fused.is_fused(x)
+    monkeypatch.setenv(fused.VARIABLE, "yes")
+    with pytest.raises(
+        BadArgument, match="TORCHGRASP_FUSED: expected 0, 1, or no value, got 'yes'"
+    ):
+        fused.is_fused(x)
+
+
+def test_loops_are_demanded_and_take_plain_float64_alone(monkeypatch):
+    x = torch.zeros(2, dtype=torch.float64)
     monkeypatch.setenv(fused.VARIABLE, "1")
     monkeypatch.setattr(fused, "has_numba", lambda: False)
     with pytest.raises(MissingExtra, match=r"TORCHGRASP_FUSED=1 needs numba.*torchgrasp\[fast\]"):

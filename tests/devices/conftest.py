@@ -20,6 +20,15 @@ from torchgrasp import (
     plan_grasps,
 )
 from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.fused import VARIABLE
+
+
+@pytest.fixture(scope="package", autouse=True)
+def operations_of_torch():
+    """Compiled loops round in another way than the operations of torch, which a device uses."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(VARIABLE, "0")
+        yield
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ KNOWN = {
     "outside": "",
     "cloud/agreement.py": "noise_of check_foot warn_of_low_table",
     "cloud/check.py": "_check _check_distinct _distinct_rows coordinate_step first_of_each",
-    "cloud/neighbours.py": "_fit_block _principal_axes clean is_flat nearest",
+    "cloud/neighbours.py": "_fit_block _principal_axes clean flat nearest",
     "cloud/prepare.py": "_fit_normals prepare_cloud share_facing",
     "cloud/surroundings.py": "find_surroundings",
     "cloud/viewpoint.py": "share_unseen",

@@ -44,7 +44,7 @@ elif not {{"import sapien", "import compileall"}} & {{x.split(",")[0] for x in a
 """
 
 
-ALL = "sim,mujoco,cluster,data,dev,docs"
+ALL = "sim,mujoco,fast,cluster,data,dev,docs"
 SAID = """Collecting beartype>=0.19 (from torchgrasp==0.1.0)
   Downloading beartype-0.23.1-py3-none-any.whl.metadata (37 kB)
   Downloading beartype-0.23.1-py3-none-any.whl (1.6 MB)
@@ -191,11 +191,11 @@ def test_extras_add_up_and_a_smaller_set_changes_nothing(set_up, cpu, tmp_path):
     assert installed("sim") == [".[sim]"] and installed("sim") == []
     assert installed("docs") == [".[docs,sim]"]  # none is forgotten when versions change
     assert installed("sim") == [] and installed("docs") == []
-    assert installed(ALL) == [".[cluster,data,dev,docs,mujoco,sim]"]
+    assert installed(ALL) == [".[cluster,data,dev,docs,fast,mujoco,sim]"]
     assert installed("sim") == []
     with (tmp_path / "project" / "constraints.txt").open("a") as constraints:
         constraints.write("new==1\n")
-    assert installed("sim") == [".[cluster,data,dev,docs,mujoco,sim]"]
+    assert installed("sim") == [".[cluster,data,dev,docs,fast,mujoco,sim]"]
     stamp.write_text(stamp.read_text().splitlines()[0])  # of a set-up that wrote no extras
     assert installed("sim") == [".[sim]"]
 

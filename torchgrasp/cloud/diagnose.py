@@ -15,7 +15,13 @@ from torchgrasp.cloud.check import (
     describe_step,
     remove_duplicates,
 )
-from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_local_planes, is_flat, nearest
+from torchgrasp.cloud.neighbours import (
+    Neighbours,
+    draw_rows,
+    find_inliers,
+    fit_local_planes,
+    nearest,
+)
 from torchgrasp.cloud.pixels import PIXELS, find_pixel_camera
 from torchgrasp.cloud.prepare import (
     ACROSS,
@@ -180,9 +186,10 @@ def diagnose_cloud(
         advice=(),
     )
     advice = judge_view(view, clean, vertical, table, stands)
+    flat = Neighbours(points).flat
     return dataclasses.replace(
         report,
-        advice=(*advice, *_advise(report, is_flat(points), angle, across, coordinate_step(points))),
+        advice=(*advice, *_advise(report, flat, angle, across, coordinate_step(points))),
     )
 
 

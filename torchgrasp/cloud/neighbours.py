@@ -134,26 +134,24 @@ class Neighbours:
         feet, normals, rms = map(torch.cat, zip(*fits, strict=True))
         return feet, normals, rms
 
-
-def is_flat(points: Points | Neighbours) -> bool:
-    """Return whether a cloud (n, 3) is no thicker than its noise. The cloud may be given with its
-    neighbours.
-
-    The noise is twice the error of quadrics around the points.
-    """
-    every = points if isinstance(points, Neighbours) else Neighbours(points.double())
-    if len(every.points) > NEAR.flat:
-        rows = draw_rows(len(every.points), NEAR.flat)
-        every = Neighbours(every.points[rows.to(every.points.device)])
-    points = every.clean.points
-    spread = torch.linalg.svdvals(points - points.mean(0)) / math.sqrt(len(points))
-    thickness, _, length = spread.sort().values.tolist()
-    # a quadric errs by no more than a plane, which is found sooner
-    mean_squares, _ = every.clean.planes
-    most = 2 * float(mean_squares[:, 0].clamp_min(0).sqrt().median())
-    if thickness >= max(most, NEAR.thin * length):
-        return False
-    return thickness < max(2 * float(every.clean.quadrics[2].median()), NEAR.thin * length)
+    @cached_property
+    def flat(self) -> bool:
+        """Whether the cloud is no thicker than its noise: twice the error of quadrics around the
+        points.
+        """
+        some = self
+        if len(self.points) > NEAR.flat:
+            rows = draw_rows(len(self.points), NEAR.flat)
+            some = Neighbours(self.points[rows.to(self.points.device)])
+        points = some.clean.points
+        spread = torch.linalg.svdvals(points - points.mean(0)) / math.sqrt(len(points))
+        thickness, _, length = spread.sort().values.tolist()
+        # a quadric errs by no more than a plane, which is found sooner
+        mean_squares, _ = some.clean.planes
+        most = 2 * float(mean_squares[:, 0].clamp_min(0).sqrt().median())
+        if thickness >= max(most, NEAR.thin * length):
+            return False
+        return thickness < max(2 * float(some.clean.quadrics[2].median()), NEAR.thin * length)
 
 
 def fit_local_planes(

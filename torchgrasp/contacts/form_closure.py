@@ -28,7 +28,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import FINGERTIPS, at_once, flatnonzero, in_chunks
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.fused import is_fused
-from torchgrasp.geometry.frames import degenerate, subsets
+from torchgrasp.geometry.frames import FLAT, degenerate, subsets
 from torchgrasp.geometry.linalg import dot, eye_like, matvec, norm, perpendicular, unit
 from torchgrasp.shape.kernel import is_plain
 
@@ -299,6 +299,10 @@ def closed_exact(
     contacts, which save time.
     """
     if points.shape[1] == 3:
+        if is_fused(points, normals):
+            from torchgrasp.contacts import fused_plane  # it imports numba
+
+            return fused_plane.closed_in_plane(points, normals, friction, PARALLEL, FLAT)
         closed = _closed_in_plane(points, normals, friction)
     else:
         closed = _closed_by_proof(points, normals, friction, guess)
@@ -330,10 +334,6 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
     these angles must positively span all planar wrenches. So no plane through two of the wrenches
     has the others on one side.
     """
-    if is_fused(points, normals):
-        from torchgrasp.contacts import fused_plane  # it imports numba
-
-        return fused_plane.closed_in_plane(points, normals, friction, PARALLEL)
     arm = scaled_arms(points)
     first, second, third = arm.unbind(1)
     across = unit(torch.linalg.cross(second - first, third - first))

@@ -43,15 +43,16 @@ def _cut(planar, points, normals, cone):
         projected = math.sqrt(inward_x * inward_x + inward_y * inward_y)
         if not projected > cone:
             return False
-        half = math.acos(cone / projected)
-        middle = math.atan2(inward_y, inward_x)
+        # the axis, turned by half of the angle between the sides, either way
+        cosine = cone / projected
+        sine = math.sqrt(1.0 - cosine * cosine)
         for side in range(2):
-            angle = middle - half if side == 0 else middle + half
-            cosine = math.cos(angle)
-            sine = math.sin(angle)
-            planar[2 * c + side, 0] = cosine
-            planar[2 * c + side, 1] = sine
-            planar[2 * c + side, 2] = x * sine - y * cosine
+            force_x = (inward_x * cosine - inward_y * sine) / projected
+            force_y = (inward_y * cosine + inward_x * sine) / projected
+            planar[2 * c + side, 0] = force_x
+            planar[2 * c + side, 1] = force_y
+            planar[2 * c + side, 2] = x * force_y - y * force_x
+            sine = -sine
     return True
 
 
@@ -78,12 +79,28 @@ def _spans(planar, parallel):
     return spans
 
 
+@inlined
+def _is_triangle(points, flat):
+    """Return whether three points are not nearly on a line, as `degenerate` defines it."""
+    first = minus(points[1], points[0])
+    second = minus(points[2], points[0])
+    third = minus(points[2], points[1])
+    longest = max(dot(first, first), dot(second, second), dot(third, third))
+    area = cross(first, second)
+    return math.sqrt(dot(area, area)) > flat * longest
+
+
 @compiled
-def _put_closed(points, normals, cone, parallel, closed):
+def _put_closed(points, normals, numbers, closed):
     """Write for each contact set whether it has force closure."""
+    cone, parallel, flat = numbers
     planar = np.empty((6, 3))
     for g in range(len(points)):
-        closed[g] = _cut(planar, points[g], normals[g], cone) and _spans(planar, parallel)
+        closed[g] = (
+            _cut(planar, points[g], normals[g], cone)
+            and _spans(planar, parallel)
+            and _is_triangle(points[g], flat)
+        )
 
 
 def closed_in_plane(
@@ -91,11 +108,14 @@ def closed_in_plane(
     normals: Float[Tensor, "b 3 3"],
     friction: float,
     parallel: float,
+    flat: float,
 ) -> Bool[Tensor, "b"]:
-    """Return the results of `_closed_in_plane` of `form_closure`. Planar wrenches with a cross
-    product shorter than `parallel` are parallel.
+    """Return the results of `closed_exact` of `form_closure` for three contacts.
+
+    Planar wrenches with a cross product shorter than `parallel` are parallel. `flat` is the bound
+    of `degenerate`.
     """
     closed = points.new_zeros(len(points)).bool()
     cone = math.cos(math.atan(friction))
-    _put_closed(array(points), array(normals), cone, parallel, closed.numpy())
+    _put_closed(array(points), array(normals), (cone, parallel, flat), closed.numpy())
     return closed

@@ -418,7 +418,7 @@ class ContactProblem:
         """
         centres = points + spread(self.tip_radius, normals) * normals
         first, second = contact_pairs(points.shape[-2], points.device)
-        return centres[..., second, :] - centres[..., first, :]
+        return centres.index_select(-2, second) - centres.index_select(-2, first)
 
     def constraints(self, points: Vectors, tension: Tensions, jet: SurfaceJet) -> Constraints:
         """Return the values of all constraints and their Jacobians for b contact sets.

@@ -2,12 +2,14 @@
 or more however little it computes.
 
 The operations of torch stay the definition: loops compute the same to 1e-9, and only where no
-gradient is needed. They are off unless the environment has `TORCHGRASP_FUSED=1`. The extra `fast`
-brings numba, which compiles each loop at its first use, and keeps the result on the disk.
+gradient is needed. The extra `fast` brings numba, which compiles each loop at its first use, and
+keeps the result on the disk. Where numba is installed, loops are on unless the environment has
+`TORCHGRASP_FUSED=0`.
 """
 
 import functools
 import hashlib
+import importlib
 import importlib.util
 import inspect
 import os
@@ -17,11 +19,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgrasp.foundation.errors import MissingExtra
+from torchgrasp.foundation.errors import BadArgument, MissingExtra
 from torchgrasp.foundation.rules import is_known, is_tracked
 
 VARIABLE = "TORCHGRASP_FUSED"
-"""Environment variable that asks for compiled loops, by the value 1."""
+"""Environment variable: "0" turns compiled loops off, and "1" demands them. Else they are on where
+numba is installed.
+"""
+LEAST_NUMBA = 0, 61
+"""Least version of numba; that of the extra `fast`."""
 REORDERED = {"reassoc", "contract", "nsz"}
 """What the compiler may change: the order of sums, so that it can use vector instructions."""
 
@@ -32,20 +38,40 @@ def has_numba() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
+@functools.cache
+def can_compile() -> bool:
+    """Return whether numba can be imported, and is new enough.
+
+    Another package may have brought one that is too old, also for the installed NumPy.
+    """
+    try:
+        numba = importlib.import_module("numba")
+    except ImportError:
+        return False
+    return numba.version_info.short >= LEAST_NUMBA
+
+
 def is_fused(*tensors: Tensor) -> bool:
-    """Return whether compiled loops are asked for and can compute with these tensors. They can with
+    """Return whether compiled loops are on and can compute with these tensors. They can with
     float64 on the CPU, which torch neither differentiates nor maps over.
 
-    Raises `MissingExtra` if they are asked for without numba.
+    Raises `MissingExtra` if they are demanded without numba, and `BadArgument` for another value of
+    `VARIABLE` than "0", "1" or none.
     """
-    if os.environ.get(VARIABLE) != "1":
-        return False
-    if not has_numba():
-        raise MissingExtra("numba", "fast", f"{VARIABLE}=1")
-    return all(
+    return are_on() and all(
         x.dtype == torch.float64 and x.device.type == "cpu" and is_known(x) and not is_tracked(x)
         for x in tensors
     )
+
+
+def are_on() -> bool:
+    """Return whether compiled loops are on; raise as `is_fused` does."""
+    asked = os.environ.get(VARIABLE, "")
+    if asked not in {"", "0", "1"}:
+        raise BadArgument(VARIABLE, repr(asked), "0, 1, or no value")
+    if asked == "1" and not has_numba():
+        raise MissingExtra("numba", "fast", f"{VARIABLE}=1")
+    return asked == "1" or (asked == "" and can_compile())
 
 
 def compiled(function: Any) -> Any:

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchgrasp.arm.reach import reach_poses, with_arm
 from torchgrasp.cloud.agreement import check_shape, warn_of_low_table
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates, warn_of_step
-from torchgrasp.cloud.neighbours import is_flat
+from torchgrasp.cloud.neighbours import Neighbours
 from torchgrasp.cloud.surroundings import find_surroundings
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
 from torchgrasp.contacts.region import seen_from
@@ -123,12 +123,14 @@ class ShapedObject:
         warn_of_step(cloud.points)
         frame = upright_frame(cloud.points, cloud.viewpoint, spec.plane)
         # shaped: the Gaussian process, its surface and the distances from the surface
+        upright = round_upright(cloud, frame)
+        neighbours = Neighbours(upright.points.double())
         shape = request.shape
         if shape is None:
             options = FitOptions(support="paper" if request.mode == "paper" else "camera")
             floor = None if spec.table is None else 0.0
-            upright = round_upright(cloud, frame)
-            shape = fit_upright(upright, request.seed, floor, options, in_image=scene is not None)
+            in_image = scene is not None
+            shape = fit_upright(upright, request.seed, floor, options, in_image, neighbours)
         else:
             shape = shape.moved(inverse(frame))
         surface = extract_mesh(shape)
@@ -138,7 +140,7 @@ class ShapedObject:
         body = EstimatedBody.around(shape, surface.vertices, field)
         # the surroundings of a scene's target
         obstacles = None
-        vague = is_vague_cloud(cloud)
+        vague = _is_vague(upright, neighbours)
         if scene is None:
             vague = vague or _is_surrounded(shape, spec.table is not None)
         else:
@@ -485,13 +487,13 @@ def find_model(request: Request) -> LearnedModel:
     return LearnedModel(load_mixture(path), sha256(path))
 
 
-def is_vague_cloud(cloud: PointCloud) -> bool:
+def _is_vague(cloud: PointCloud, neighbours: Neighbours) -> bool:
     """Return whether a cloud hardly shows its object: it has few points, lies in one plane, or is
-    cut off.
+    cut off. The `neighbours` are those of its points.
     """
     in_image = cloud.frustum is not None and cloud.viewpoint is not None
     cut = in_image and silhouettes(cloud.to("cpu")).cut
-    return cut or len(cloud) < FEW_POINTS or is_flat(cloud.points)
+    return cut or len(cloud) < FEW_POINTS or neighbours.flat
 
 
 def _is_surrounded(shape: ShapeGP, on_table: bool) -> bool:

@@ -9,7 +9,7 @@ import torch
 from torchgrasp.cloud.advice import check_camera
 from torchgrasp.cloud.agreement import check_foot, warn_of_low_table
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates, warn_of_step
-from torchgrasp.cloud.neighbours import Neighbours, is_flat, nearest
+from torchgrasp.cloud.neighbours import Neighbours, nearest
 from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, clean_cloud, prepare_cloud
 from torchgrasp.cloud.surroundings import find_surroundings
@@ -187,22 +187,24 @@ def fit_upright(
     table: float | None,
     options: FitOptions,
     in_image: bool = False,
+    neighbours: Neighbours | None = None,
 ) -> ShapeGP:
     """Return the shape fitted to a cloud [m] without duplicates in a frame whose z axis points up.
 
     `table` is the table's height [m]; None means no table. `seed` is the random seed, and `options`
     are those of `fit_shape`. `in_image` says that the points are pixels of a depth image. Then they
-    need not be compared with their camera.
+    need not be compared with their camera. `neighbours` are those of the points in float64, if they
+    are known.
     """
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))
         if not in_image:  # in a scene, others may hide the foot
             warn_of_low_table(cloud, Plane.horizontal(table))
-    neighbours = Neighbours(cloud.points.double())
+    neighbours = neighbours or Neighbours(cloud.points.double())
     if len(cloud) < FEW_POINTS:
         few = f"{len(cloud)} points, where a shape needs {FEW_POINTS}"
         warn_user(FewPoints, f"{few}: the shape is a guess; give more points")
-    elif is_flat(neighbours):
+    elif neighbours.flat:
         warn_user(
             Flat,
             "the points lie in one plane, to their noise: the thickness is a guess; "

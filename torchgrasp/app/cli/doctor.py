@@ -33,7 +33,7 @@ NEEDED_BY = {
     "film": "MP4 files of `torchgrasp film`",
     "mcp": "`torchgrasp mcp`",
     "meshes": "hands with .dae meshes",
-    "fast": "TORCHGRASP_FUSED=1",
+    "fast": "planning by compiled loops",
     "realsense": "`torchgrasp grasp --realsense`",
     "rerun": "`torchgrasp grasp --rerun`",
     "robots": "hands of robot_descriptions",
