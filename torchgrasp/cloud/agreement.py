@@ -93,9 +93,11 @@ def check_agreement(
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
     """Raise `BadArgument` if many points of an object's cloud do not lie on the object's mesh.
 
-    The mesh [m] is in the frame of the cloud. Errors call it by `name`. The warning `CloudWarning`
-    tells that most points are farther from it than noise and pose error explain. An
-    example is the mesh of a similar object.
+    At most 20 % of the points (`AGREEMENT.share`) may be off it. A point is off if its distance
+    exceeds 10 mm (`AGREEMENT.slack`) plus twice the camera's noise (`noise_of`). The mesh [m] is in
+    the frame of the cloud. Errors call it by `name`. The warning `CloudWarning` tells that most
+    points are farther from it than noise and pose error explain. An example is the mesh of a
+    similar object.
     """
     noise = noise_of(cloud)
     slack = AGREEMENT.slack + 2 * noise
@@ -113,11 +115,12 @@ def check_contacts(
     slack: float = AGREEMENT.slack,
     share: float = AGREEMENT.guessed,
 ) -> None:
-    """Raise `BadArgument` if too many contacts of grasps are off their object's mesh: more than a
-    `share`, farther than `slack` [m].
+    """Raise `BadArgument` if too many contacts of grasps are off their object's mesh.
 
-    The mesh [m] is in the frame of the grasps. A mesh that floats above the table of the grasps, or
-    sinks far into it, is refused, too.
+    At most a `share` of the contacts may be farther than `slack` [m] from the mesh. The mesh [m] is
+    in the frame of the grasps. A mesh that does not stand on the table of the grasps is refused,
+    too (`check_stand`). But 30 % of its height (`AGREEMENT.sunk`) may be below the table, because
+    the table may be a guess.
     """
     if not len(grasps):
         return
@@ -136,7 +139,9 @@ def check_seen(grasps: Grasps, cloud: PointCloud, name: str) -> None:
     """Raise `BadArgument` if many contacts of grasps lie off the view of their object and the space
     hidden behind it.
 
-    The cloud is in the frame of the grasps. Errors call the argument `name`.
+    At most half of the contacts (`AGREEMENT.unseen_share`) may be more than 30 mm
+    (`AGREEMENT.unseen`) from both. The cloud is in the frame of the grasps. Errors call the
+    argument `name`.
     """
     if len(grasps):
         points = grasps.contacts.points.reshape(-1, 3)
@@ -146,6 +151,9 @@ def check_seen(grasps: Grasps, cloud: PointCloud, name: str) -> None:
 
 def check_where(name: str, distance: Callable[[Points], Tensor], cloud: PointCloud) -> None:
     """Raise `BadArgument` for a region "keep" that lies off a cloud and the space hidden behind it.
+
+    Such a region is more than 30 mm (`AGREEMENT.unseen`) from both. For a cloud without a camera
+    the bound grows by half the cloud's length, in place of the hidden space.
 
     The function `distance` returns the signed distances [m] of points [m] in the frame of the
     cloud. Errors call the argument `name`. A region of another `name` raises the warning `NoEffect`
@@ -180,7 +188,8 @@ def check_where(name: str, distance: Callable[[Points], Tensor], cloud: PointClo
 def check_shape(field: DistanceField, cloud: PointCloud) -> None:
     """Raise `BadArgument` if the points of a cloud lie off the surface of its estimated shape.
 
-    The `field` holds the shape's signed distances [m], in the frame of the cloud.
+    Their median distance may be up to 10 mm (`AGREEMENT.slack`) plus twice the camera's noise
+    (`noise_of`). The `field` holds the shape's signed distances [m], in the frame of the cloud.
     """
     points = cloud.points[draw_rows(len(cloud), AGREEMENT.drawn)]
     off = float(field.query(points.to(field.nodes))[0].abs().median())
@@ -192,7 +201,9 @@ def check_shape(field: DistanceField, cloud: PointCloud) -> None:
 def check_foot(cloud: PointCloud, table: Plane) -> None:
     """Raise `BadArgument` for a table that lies above the lowest points of its object.
 
-    The table is in the frame of the cloud.
+    It may be up to 15 mm (`AGREEMENT.foot`) plus twice the camera's noise (`noise_of`) above them.
+    The lowest 2 % of the points (`AGREEMENT.lowest`) do not count. The table is in the frame of the
+    cloud.
     """
     height = table.height(cloud.points.double().cpu())
     foot = float(height.quantile(AGREEMENT.lowest))
@@ -219,7 +230,8 @@ def warn_of_low_table(cloud: PointCloud, table: Plane) -> None:
 def check_stand(mesh: "trimesh.Trimesh", table: Plane, name: str = "mesh") -> None:
     """Raise `BadArgument` if the mesh of an object floats above its table or sinks into it.
 
-    The mesh [m] is in the frame of the table. Errors call it by `name`.
+    Its lowest vertex may be up to 15 mm (`AGREEMENT.foot`) above or below the table. The mesh [m]
+    is in the frame of the table. Errors call it by `name`.
     """
     foot = float(table.height(torch.tensor(mesh.vertices, dtype=torch.float64)).min())
     if abs(foot) > AGREEMENT.foot:

@@ -174,8 +174,8 @@ def _check(cloud: PointCloud) -> Points:
 
 
 def coordinate_step(points: Points) -> float:
-    """Return the step [m] to which all coordinates (n, 3) [m] are rounded; 0 if it is too small to
-    tell, or the points are too few.
+    """Return the step [m] to which all coordinates (n, 3) [m] are rounded. Return 0 for a step
+    below 2 mm (`CLOUD.coarse`), or for fewer than 100 points (`FEW_POINTS`).
 
     Numbers in float32 have large steps far from the origin, and texts of two decimals have others.
     """
@@ -200,7 +200,9 @@ def describe_step(step: float) -> str:
 
 
 def warn_of_step(points: Points) -> None:
-    """Warn of points (n, 3) [m] whose coordinates are rounded to a large step."""
+    """Warn (`CloudWarning`) of points (n, 3) [m] whose coordinates are rounded to a step of 2 mm
+    (`CLOUD.coarse`) or more.
+    """
     step = coordinate_step(points)
     if step > 0:
         fix = "give more digits, or subtract an offset in float64 before float32 is written"

@@ -102,7 +102,9 @@ MOTION = RegistrationNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """The motion of a view onto another one, and how far they were apart."""
+    """The rigid motion after which a view agrees best with another one, and how far the views were
+    apart before.
+    """
 
     pose: Float[Tensor, "4 4"]  # new_from_old [m]
     shift: float  # length of the shift of the points' mean [m]
@@ -113,19 +115,27 @@ class Motion:
 
     @property
     def error(self) -> float:
-        """The distance [m] of the views, including the part that the overlap does not show. It is 0
-        if noise explains the motion.
+        """The rms distance [m] by which the motion moves the points along their normals; 0 if noise
+        explains the motion.
+
+        It is sqrt(`distance`^2 + `unsure`^2): what the overlap of the views shows, and an estimate
+        of what it does not show. Noise explains a motion whose `chi_squared` is at most 1
+        (`VIEWS.likely`).
         """
         return math.hypot(self.distance, self.unsure) if self.chi_squared > VIEWS.likely else 0.0
 
     @property
     def shown(self) -> bool:
-        """Whether noise and bias of the cameras do not explain the motion."""
+        """Whether noise and bias of the cameras do not explain the motion: its `chi_squared` is
+        above 4 (`VIEWS.shown`).
+        """
         return self.chi_squared > VIEWS.shown
 
 
 def compare_views(views: Sequence[PointCloud]) -> list[float]:
-    """Return the standard deviation [m] of each view's pose that the other views show; 0 for none.
+    """Return the standard deviation [m] of each view's pose, estimated from the other views.
+
+    It is 0 for a view whose distance from the others is explained by noise, or is unknown.
 
     The views [m], with normals, are in one frame, each with at most one camera. Raises
     `BadArgument` if two contradict each other beyond their noise, and names those that are farthest
@@ -164,11 +174,13 @@ def compare_views(views: Sequence[PointCloud]) -> list[float]:
 
 
 def compare_with(seen: PointCloud, view: PointCloud) -> float:
-    """Return the standard deviation [m] of a view's pose that what was seen before shows; 0 for
-    none.
+    """Return the standard deviation [m] of a view's pose, estimated from what was seen before.
 
-    Both have normals and are in one frame [m]. Raises `BadArgument` for a view that is too far off.
-    A distance that noise does not explain raises the warning `MendedInput`.
+    It is 0 if noise explains the distance of the two, or if they overlap too little. Both have
+    normals and are in one frame [m]. Raises `BadArgument` for a view that is too far off for its
+    noise. The bounds on its distance and its shift are `VIEWS.refused` and `VIEWS.shifted`,
+    multiples of the noise. A lesser distance that noise does not explain raises the warning
+    `MendedInput`.
     """
     one = _ViewSurface(seen)
     motion = _find_motion(one, _ViewSurface(view, one.noise))

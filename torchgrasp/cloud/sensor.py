@@ -344,9 +344,9 @@ def estimate_noise(
 ) -> SensorNoise | None:
     """Return the noise that a table shows; None if fewer than 1000 pixels show the table.
 
-    Its random part is `floor` and `growth`, its smooth part `bias`. The depth (h, w) is in metres,
-    the intrinsics are in pixels, and the plane is in the camera's frame. Of the pixels `on_table`,
-    those over 20 mm from the plane do not count.
+    The fields `floor` [m] and `growth` [1/m] are its random part (`fit_noise`). `bias` [m] is its
+    smooth part. The depth (h, w) is in metres, the intrinsics are in pixels, and the plane is in
+    the camera's frame. Of the pixels `on_table`, those over 20 mm from the plane do not count.
     """
     row, column = (torch.arange(n, dtype=torch.float64) for n in depth.shape)
     x = (column - intrinsics[0, 2]) / intrinsics[0, 0]
@@ -369,10 +369,12 @@ def estimate_noise(
 
 
 def fit_noise(depth: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> SensorNoise:
-    """Return a noise model whose `floor` and `growth` are fitted robustly to depth errors.
+    """Return a noise model whose random noise is fitted robustly to depth errors.
 
-    `error` holds the errors [m] of n pixels at the depths `depth` [m]. Fewer than 100 errors give
-    the default model.
+    At depth z [m] its standard deviation [m] is sqrt(floor^2 + (growth z^2)^2). The fields `floor`
+    [m] and `growth` [1/m] are fitted, and others have their defaults. `error` holds the errors [m]
+    of n pixels at the depths `depth` [m]. Fewer than 100 errors (`ESTIMATE.errors`) give
+    `SensorNoise()`.
     """
     if len(depth) < ESTIMATE.errors:
         return SensorNoise()

@@ -81,15 +81,20 @@ CRITICAL = CriticalNumbers()
 
 
 class LeastBalance(NamedTuple):
-    """Balanced forces that need the least friction, with the multipliers that prove it.
+    """Balanced forces of b contact sets that need the least friction. The Lagrange multipliers
+    prove that no lesser friction is enough.
+
+    Vectors are in the frame of the contact points. Lengths are divided by the root-mean-square
+    radius of the contacts (`scaled_arms`), so nothing has a unit.
 
     Args:
         forces: forces f on the object (b, f, 3), with a mean normal force of 1.
         friction: the friction coefficient mu (b,).
-        press: multipliers s_0 of the cones (b, f).
-        slide: tangential multipliers of the cones (b, f, 3).
-        twist: motion y of the object (b, 6), in the units of `scaled_arms`.
-        scale: multiplier l of the sum of the normal forces (b,).
+        press: multipliers s_0 (b, f) of the friction cones: their parts along the inward normals.
+        slide: multipliers (b, f, 3) of the friction cones: their parts tangential to the surface.
+        twist: multiplier y (b, 6) of the balance, a motion of the object: velocity of the contacts'
+            centroid, then angular velocity.
+        scale: multiplier l (b,) of the sum of the normal forces.
     """
 
     forces: Vectors

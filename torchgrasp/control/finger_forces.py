@@ -91,9 +91,9 @@ class Squeeze(NamedTuple):
     """Joint targets that press on the object in g grasps, with their fingertip forces and joint
     torques.
 
-    `joints` [rad] are the targets of the h actuated joints. `forces` [N] are those of the f
-    fingertips on the object, in the hand's frame. `torques` [N m] of the actuated joints exert
-    these forces.
+    `joints` [rad or m] are the targets of the h actuated joints. `forces` [N] are those of the f
+    fingertips on the object, in the frame of the hand's root link. `torques` [N m or N] of the
+    actuated joints exert these forces.
     """
 
     joints: Float[Tensor, "g h"]
@@ -114,10 +114,9 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
 
     The targets solve J^T f = K (target - q). Here q are the joints of the grasp, f the forces,
     and J the Jacobian of the contacts. K is diagonal. Each actuated joint has the `kp` of its own
-    drive and of its coupled joints, times their squared ratios. If no forces that press at every
-    contact balance, each force is `force` along the inward normal. The targets are differentiable
-    in the joints of the grasps. The forces, found by a search, are not differentiable in the
-    contacts.
+    drive and of its coupled joints, times their squared ratios. Where no balanced forces press at
+    every contact, each force is `force` along the inward normal. The targets are differentiable in
+    the joints of the grasps. The forces, found by a search, are not differentiable in the contacts.
 
     Args:
         hand: the hand of the grasps, on any device; the results are on that of the grasps.
@@ -206,7 +205,8 @@ def press(
 
     `joints` [rad] are the present actuated joints, and `jacobian` [m/rad] is that of the contact
     points by them. `forces` [N] act on the object, in the frame of the Jacobian. `stiffness`
-    [N m/rad] is that of each actuated joint.
+    [N m/rad] is that of each actuated joint. For sliding joints, metres replace radians, and
+    newtons replace newton metres.
     """
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)

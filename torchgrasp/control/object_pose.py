@@ -105,8 +105,9 @@ class ContactPlanes:
         """Return the most probable displacement (6,) of the object, in the planned hand's frame.
 
         First comes the translation [m] of the contacts' centroid, then the rotation vector [rad]
-        about it. `points` [m] are the points of the fingertips that would touch first; `touching`
-        marks fingertips that touch. Both are in the order of the hand's fingers.
+        about it. `points` (f, 3) [m] hold the point of each fingertip that would touch first, in
+        the same frame. `touching` marks the fingertips that touch. Both are in the order of the
+        hand's fingers.
         """
         off = ((points - self.target) * self.normals).sum(-1)
         beyond = (off - self.rows @ self.expected).clamp_min(-PLANES.missed)

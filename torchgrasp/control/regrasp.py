@@ -69,9 +69,10 @@ def next_grasp(
 
 @checked
 def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
-    """Return the indices of the grasps that differ from all `tried` (indices).
+    """Return the indices (k,) of the grasps that differ from each grasp with an index in `tried`.
 
-    They differ by more than `REGRASP.turn` in approach, or `REGRASP.gap` in contacts.
+    Two grasps differ if their approaches are more than 30 degrees apart (`REGRASP.turn`). They also
+    differ if the mean distance of their contacts is more than 15 mm (`REGRASP.gap`).
     """
     approach = grasps.approach
     points = grasps.contacts.points.double()
@@ -209,9 +210,10 @@ class GraspTry:
         """Return an iterable of the `Targets` of each tick in which the lowered hand opens and
         withdraws.
 
-        The hand withdraws as `Targets.left` grows from 0 to `length`, then waits for the same time.
-        The attribute `speed` [m/s] of the result is the rate of this growth at the last target that
-        was drawn.
+        The fingers open first. Then the hand moves straight back against its approach.
+        `Targets.left` [m] is how far it has moved, from 0 to `length`. In the end it waits for as
+        long as it moved. The attribute `speed` [m/s] of the result is the hand's speed at the
+        latest of these targets.
 
         Args:
             observation: the last observation, which shows where the fingers begin.
@@ -260,7 +262,7 @@ class Withdrawal:
     """The targets of each tick in which a hand opens, withdraws against its approach, and waits
     until the object rests.
 
-    `speed` [m/s] is that at which `Targets.left` grows at the last target.
+    `speed` [m/s] is the speed of the withdrawing hand at the latest of these targets.
     """
 
     def __init__(

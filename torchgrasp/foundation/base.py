@@ -240,7 +240,9 @@ class Batch(Value):
 def read_rows(rows: Any, count: int) -> slice | Tensor:
     """Return any index of a batch of `count` rows as a slice, or as a tensor of indices (k,).
 
-    `rows` is what `Batch.__getitem__` accepts; the errors are those of that method.
+    `rows` is an index, a slice, a mask (count,), or a list or tensor (k,) of indices. Indices of a
+    list or tensor are not compared with `count`. Raises `BadArgument` for anything else, such as a
+    mask of another length. Raises `IndexError` for a single index out of range.
     """
     refused = BadArgument(
         "rows", show(rows), "an index, a slice, a mask of all rows or a tensor of indices"

@@ -136,11 +136,11 @@ def _inward_volume(mesh: "trimesh.Trimesh") -> float:
 
 
 def with_true_normals(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
-    """Return a mesh whose face normals follow from its vertices. This is the mesh itself if its
-    normals do, else a bare copy.
+    """Return a mesh whose face normals are those of its triangles.
 
-    trimesh before 5.2 keeps normals that were read before an uneven scaling. It casts rays by them,
-    too. A file may bring wrong normals as well.
+    A mesh with such normals is returned itself. Another one is copied, its vertices and faces
+    alone. Before version 5.2, trimesh keeps normals that were read before an uneven scaling, and
+    casts rays by them. A file may also hold wrong normals.
     """
     corners = np.asarray(mesh.vertices)[mesh.faces]  # (f, 3 corners, 3)
     normals, valid = trimesh.triangles.normals(corners)

@@ -91,7 +91,8 @@ def assume_noise(
 ) -> Float[Tensor, "n"]:
     """Return the assumed depth noise [m] of each point [m], for a camera at `eye` [m].
 
-    The noise grows with the squared distance. None means an unknown camera, at `PLANES.distance`.
+    The noise grows with the squared distance. None means an unknown camera, 0.7 m
+    (`PLANES.distance`) from each point.
     """
     if eye is None:
         squared = torch.full((len(points),), PLANES.distance**2, dtype=points.dtype, device="cpu")
@@ -147,8 +148,8 @@ class PlaneFit:
         """Return the plane with its normal turned to the upper side.
 
         `view` holds all points of the view. If their upward direction is unknown, the normal points
-        to the camera. If that is unknown too, it points to the side on which most points are. They
-        are weighted by their heights up to `PLANES.reach`.
+        to the camera. If that is unknown too, it points to the side on which most points are. Each
+        point counts by its distance from the plane, at most by 0.3 m (`PLANES.reach`).
         """
         if view.sky is not None:
             side = float(self.normal @ view.sky)
@@ -163,8 +164,8 @@ class PlaneFit:
 
 
 def fit_planes(view: SeenPoints, generator: torch.Generator) -> Iterator[PlaneFit]:
-    """Yield at most `PLANES.planes` planes, each the one with most of the points that no earlier
-    plane holds.
+    """Yield at most 8 planes (`PLANES.planes`), each the one with most of the points that no
+    earlier plane holds.
 
     `generator` draws the triples of points that propose planes.
     """
@@ -314,8 +315,10 @@ def _held(
 
 
 def refine_plane(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) -> PlaneFit:
-    """Refine a plane by iterated least squares with Tukey's weights, which change smoothly with the
-    points.
+    """Return the plane near a given one that best fits the points of a view.
+
+    The given plane has the unit vector `normal` and the `offset` [m]. Least squares are iterated
+    with Tukey's weights, which change smoothly with the points.
     """
     points = view.points
     noise = view.noise

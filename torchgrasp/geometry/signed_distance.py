@@ -40,24 +40,25 @@ FIELDS = FieldNumbers()
 
 
 class Grid(NamedTuple):
-    """The grid in which points are looked up.
+    """The grid of a `DistanceField` in which points are looked up.
 
-    There is one for all points, or one for each entry of a batch.
+    It is one grid for all points, or a grid for each entry of a batch. The axes `*b` broadcast with
+    the axes (*b, 3) of the points.
     """
 
     origin: Float[Tensor, "*b 3"]  # position [m] of node (0, 0, 0)
     spacing: float | Float[Tensor, "*b 1"]  # distance [m] of neighbouring nodes
     last: Int[Tensor, "*b 3"]  # index of the last node on each axis
-    stride: Any  # two numbers of values, between neighbours on the x and on the y axis
-    first: Any  # index of the grid's first value in `DistanceField.nodes`
-    # index steps in `DistanceField.nodes` from the first corner of a cell to its 8 corners
+    stride: Any  # steps in `DistanceField.nodes` to the next node on x and on y; on z it is 1
+    first: Any  # index of node (0, 0, 0) in `DistanceField.nodes`
+    # steps in `DistanceField.nodes` from the first corner of a cell to its 8 corners
     corners: Int[Tensor, "8 *b"]
 
 
 class DistanceField(Value, abc.ABC):
     """Signed distances [m] at the `nodes` of a grid, negative inside.
 
-    It holds the grid of one object for all points, or an own grid for each of r entries.
+    It holds the grid of one object for all points, or r grids, one for each entry of a batch.
     """
 
     nodes: Any  # Float[Tensor, "n"] [m], the values of all nodes, those of the z axis contiguous
@@ -228,7 +229,7 @@ def field_from_surface(
 
     `vertices` (v, 3) are in metres; `faces` (f, 3) holds the indices of three vertices each. The
     nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh. Raises `BadArgument`
-    for more than `FIELDS.most_nodes` nodes.
+    for more than 20 million nodes (`FIELDS.most_nodes`).
     """
     check_tensor("vertices", vertices, (None, 3))
     surface = MeshSurface(vertices, faces)

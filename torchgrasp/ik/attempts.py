@@ -93,8 +93,8 @@ class Attempts(Generic[Result]):
                 self.add(refine(chosen), chosen.row)
 
     def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
-        """Return the best result of each of t contact sets with results, then the index of that
-        set.
+        """Return the best result of each contact set that has one, t in all. Return then the
+        indices (t,) of these contact sets.
 
         `keys` returns tensors (k,) for k results. The best result has the least first key; in a tie
         the next key decides.
@@ -111,10 +111,11 @@ def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
 
 
 def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
-    """Return the best grasp of each of t contact sets with results, then the index of that set.
+    """Return the best grasp of each contact set that has one in `attempts`, t in all. Return then
+    the indices (t,) of these contact sets.
 
-    An executable grasp comes first, then one that failed on valid contacts, then others. In a tie
-    the higher score decides.
+    An executable grasp is best. Next is a failed grasp whose contacts violate no constraint, then
+    any other. In a tie the higher `score` decides.
     """
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:

@@ -108,9 +108,10 @@ class JointState(Batch):
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "JointState":
         """Return the states of g grasps after a `step` (g, d) of all unknowns.
 
-        The d columns are changes of the hand pose (6), the joints [rad], the contact points (3 f)
+        The d columns are changes of the hand pose (6), the joints, the contact points (3 f)
         and the tensions. The change of the pose is a translation [m] and a rotation vector [rad] in
-        the hand's axes. Points are normalised, and tensions have no unit.
+        the hand's axes. Joints are in rad, or in metres if they slide. Points are normalised, and
+        tensions have no unit.
         """
         by_hand, by_points, by_tension = step.split(
             [6 + hand.dof, self.points[0].numel(), self.tension.shape[1]], 1
@@ -223,10 +224,12 @@ class JointProblem:
     def solve(
         self, configuration: Configuration, points: Float[Tensor, "g f 3"]
     ) -> tuple[Configuration, Float[Tensor, "k f 3"], Int[Tensor, "k"]]:
-        """Return the optimised hands, then their contacts (k, f, 3), then the indices of the k
-        grasps of low cost.
+        """Return the hands, then the normalised contacts (k, f, 3), of the k grasps of low cost.
+        Return also their indices (k,) among the g grasps at the start.
 
-        `configuration` and the normalised `points` are those at the start.
+        `configuration` holds the g hands at the start, and `points` their normalised contacts. The
+        least-squares problem is solved in stages (`STAGES`). After each stage, grasps whose cost
+        [mm2] is not below the stage's `hopeless` are given up.
         """
         own = self
         largest = self.contact_problem.spec.flatness
@@ -263,12 +266,13 @@ def solve_sliding(
 ) -> None:
     """Optimise hand and contacts together for each unsolved contact set of `attempts`.
 
-    The checked grasps are added to `attempts`, except those of too high a cost.
+    The checked grasps are added to `attempts`, except those that `JointProblem.solve` gives up.
 
     Args:
         joint_problem: the least-squares problem of hand and contacts, for each contact set.
         problem: the contact sets, from whose contacts the optimisation starts, and the checks.
-        seeds: initial hand postures, of which the first `SLIDING.seeds` of each set are tried.
+        seeds: initial hand postures, of which the first two of each set (`SLIDING.seeds`) are
+            tried.
         attempts: the results so far.
     """
     chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, SLIDING.seeds)

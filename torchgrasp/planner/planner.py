@@ -115,11 +115,12 @@ def step(
 def try_first(
     objects: Objects, rows: Candidates, fresh: Int[Tensor, "k"]
 ) -> tuple[Candidates, Int[Tensor, "e"]]:
-    """Solve for the hand on the contact sets `fresh` with few solver steps, for an early grasp.
+    """Solve for the hand on fixed contacts with few solver steps, for an early grasp.
 
-    Return all contact sets `rows` with the results, then the indices of those that ended. A solved
-    set ends (`Row.ENDED`); a failed one gets `Row.BEGUN`. For an object without a grasp by then,
-    `try_fully` goes on with its sets at once. `fresh` holds indices in `rows`.
+    `rows` are all contact sets, and `fresh` holds the indices of those to try. Return all contact
+    sets with the results, then the indices of those that ended. A solved set ends (`Row.ENDED`); a
+    failed one gets `Row.BEGUN`. For an object without a grasp by then, `try_fully` goes on with its
+    sets at once.
     """
     rows, solved = solve_fixed(objects, rows, fresh, FEW_STEPS, Row.BEGUN)
     missing = without(rows, solved, len(objects))
@@ -135,13 +136,14 @@ def try_fully(
     ended: Int[Tensor, "d"],
     last: bool,
 ) -> tuple[Candidates, Int[Tensor, "e"]]:
-    """Solve for the hand on the contact sets `tried` with all steps, then with sliding contacts.
+    """Solve for the hand on fixed contacts with all solver steps, then with sliding contacts.
 
-    Return all contact sets `rows` with the results, then the indices of those that ended in this
-    batch: those in `ended`, which ended earlier in it, and the new ones. A solved set ends
-    (`Row.ENDED`); a failed one gets `Row.STUCK`. `solve_with_sliding` then tries stuck sets, and
-    ends them. It takes long. So in the `last` batch it tries all stuck sets. In others it tries
-    those of objects without a grasp in this batch.
+    `rows` are all contact sets, and `tried` holds the indices of those to try. Those with the
+    indices `ended` ended earlier in this batch. Return all contact sets with the results, then
+    `ended` with the indices of those that ended now. A solved set ends (`Row.ENDED`); a failed one
+    gets `Row.STUCK`. `solve_with_sliding` then tries stuck sets, and ends them. It takes long. So
+    in the `last` batch it tries all stuck sets. In others it tries those of objects without a grasp
+    in this batch.
     """
     clouds = len(objects)
     rows, solved = solve_fixed(objects, rows, tried, ITERATIONS, Row.STUCK)
@@ -168,11 +170,11 @@ def without(rows: Candidates, solved: Int[Tensor, "k"], clouds: int) -> Bool[Ten
 def solve_fixed(
     objects: Objects, rows: Candidates, now: Int[Tensor, "k"], steps: int, failed: Row
 ) -> tuple[Candidates, Int[Tensor, "s"]]:
-    """Solve for the hand on the fixed contacts of the sets `now`, with at most `steps` steps.
+    """Solve for the hand on fixed contacts, with at most `steps` solver steps.
 
-    Return all contact sets `rows` with the results, then the indices of the solved ones. Solved
-    sets get `Row.ENDED` and their executable grasp; the others get the status `failed` and their
-    best failed grasp. `now` holds indices in `rows`.
+    `rows` are all contact sets, and `now` holds the indices of those to try. Return all contact
+    sets with the results, then the indices of the solved ones. Solved sets get `Row.ENDED` and
+    their executable grasp. The others in `now` get the status `failed` and their best failed grasp.
     """
     contacts, certificate, seeds = rows.select(now)
     reach = objects.reach(contacts, certificate, rows.cloud[now])
@@ -185,10 +187,11 @@ def solve_fixed(
 def solve_with_sliding(
     objects: Objects, rows: Candidates, now: Int[Tensor, "k"]
 ) -> tuple[Candidates, Int[Tensor, "k"]]:
-    """Solve for hand and sliding contacts together, for the contact sets `now`.
+    """Solve for hand and contacts together, where the contacts slide on the surface.
 
-    Return all contact sets `rows` with the results, then the indices `now` of the tried ones. All
-    tried sets get `Row.ENDED`, and their best grasp so far, which may be a failed one.
+    `rows` are all contact sets, and `now` holds the indices of those to try. Return all contact
+    sets with the results, then the indices in `now`, in any order. Each tried set gets `Row.ENDED`
+    and its best grasp so far, which may be a failed one.
     """
     contacts, certificate, seeds = rows.select(now)
     attempts = Attempts(torch.ones_like(certificate.closed), executable)

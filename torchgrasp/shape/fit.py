@@ -164,17 +164,25 @@ def fit_shape(
 
 @dataclasses.dataclass(frozen=True)
 class FitOptions:
-    """Options of a shape fit, with the meaning that they have as arguments of `fit_shape`."""
+    """Options of a shape fit, with the meaning that they have as arguments of `fit_shape`.
+
+    A `budget` of None means the default number of the `support`. "sure" means as many points as
+    bring the variance down to `noise`, at most 1000 (`SHAPE.budget`).
+    """
 
     noise: float = 0.01  # standard deviation of an observed distance, in radii of the object
     budget: int | Literal["sure"] | None = None  # number of observed points
     psi_scale: float = 1.5  # the kernel's length over the longest distance of observed points
     support: Literal["camera", "paper"] = "camera"  # observations besides the cloud's points
-    kernel: KernelName | Kernel = "thin_plate"
+    kernel: KernelName | Kernel = "thin_plate"  # covariance of the signed distance at two points
     criterion: Criterion = "variance"  # what is greatest at the most informative point
 
     def selected(self) -> tuple[int, float]:
-        """Return the number of observed points, and the variance at which their selection ends."""
+        """Return the greatest number of observed points, and the variance at which their selection
+        ends, in squared normalised units.
+
+        The variance is -inf if the number alone ends it.
+        """
         if self.budget == "sure":
             return SHAPE.budget, self.noise
         usual = SHAPE.camera if self.support == "camera" else SHAPE.paper

@@ -465,7 +465,11 @@ def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4
 
 
 class FingerSet(NamedTuple):
-    """A set of fingers that grasp: their tips, and the positions [rad or m] of parked joints."""
+    """A set of fingers that grasp, and the positions of the joints that stay fixed meanwhile.
+
+    `tips` are the names of the fingertip links. `parked` holds the positions [rad or m], by name of
+    the joint.
+    """
 
     tips: list[str]
     parked: dict[str, float]

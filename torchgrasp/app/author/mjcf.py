@@ -21,10 +21,14 @@ from torchgrasp.sim.mujoco_scene import import_mujoco
 
 
 class FromMjcf(NamedTuple):
-    """An MJCF as a URDF.
+    """An MJCF, a model file of MuJoCo, as a URDF.
 
-    `tips` are the links with a site at a fingertip, () if these are not three to five. `told` and
-    `warnings` hold a sentence each for what the URDF says otherwise, or cannot say.
+    Attributes:
+        urdf: the URDF.
+        tips: names of the links with a site at a fingertip; () if these are not three to five.
+        told: sentences for the user on how the URDF was made, such as bodies that are left out.
+        warnings: sentences for the user on what the URDF lacks and the hand may need. These are
+            limits on sums of joints, and tendons without a motor.
     """
 
     urdf: Urdf

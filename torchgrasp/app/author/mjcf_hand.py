@@ -38,7 +38,8 @@ class ModelHand:
         on_world: whether the fingers are fixed to the world, whose shapes are then the palm.
         parents, names: the parent's index and the name of each body of the model.
         owners, joint_names: the body's index and the name of each joint of the model.
-        told, warnings: sentences for the user.
+        told: sentences for the user on how the hand becomes a URDF.
+        warnings: sentences for the user on what the URDF lacks and the hand may need.
     """
 
     def __init__(self, mujoco: Any, model: Any, path: Path) -> None:

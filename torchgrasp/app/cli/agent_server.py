@@ -72,9 +72,10 @@ def serve(folder: Path, http: int | None, seconds: float) -> int:
 
 
 def bind_port(number: int) -> socket.socket:
-    """Return a socket of this machine alone on a port, by HTTP's option; 0 takes a free port.
+    """Return a socket on the port `number`, for programs of this machine alone; 0 takes a free
+    port.
 
-    Raises `BadArgument` for a number that is no port, or a port in use.
+    Raises `BadArgument`, which names --http, for a number that is no port, or a port in use.
     """
     if not 0 <= number <= SERVER.last_port:
         raise BadArgument("--http", number, f"a port up to {SERVER.last_port}, or 0 for any")
@@ -222,10 +223,11 @@ class AgentServer:
 
 
 def do_work(tool: Tool, place: Workplace) -> Answer:
-    """Return the answer of a tool with the warnings that the library gave; runs in a worker.
+    """Run a tool, and return its answer with the library's warnings among the notes.
 
-    Errors that are none of the library's are shown with their place on stderr, and told in a
-    sentence.
+    It runs in a worker process. `place` is the folder in which the tool reads and writes files.
+    Errors of the library pass. For any other error, the traceback is written to stderr, and
+    `GraspError` is raised.
     """
     with _stdout_elsewhere(), warnings.catch_warnings(record=True) as heard, naming(**NAMES):
         warnings.simplefilter("always", UserWarning)
@@ -294,7 +296,9 @@ def _stdin_that_ends() -> Iterator[None]:
 
 
 def say(told: GraspError | str) -> str:
-    """Return an error or advice as one line, with arguments of tools in place of options."""
+    """Return an error or advice as one line. Options of the command line become the arguments of a
+    tool.
+    """
     line = one_line(told)
     if LIBRARY in line:
         return line

@@ -76,7 +76,9 @@ class Doctor(ForPrograms):
 
 
 def find_parts() -> list[Finding]:
-    """Return the state of every part of the installation."""
+    """Return the state of every part of the installation: the library, Python, packages, processor,
+    GPU, simulators and extras.
+    """
     hands = ", ".join(list_hands())
     gpu = "none visible to torch; everything runs on the processor"  # no fault
     if torch.cuda.is_available():

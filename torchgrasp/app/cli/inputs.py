@@ -77,7 +77,10 @@ class ViewOptions:
 
     @property
     def vertical(self) -> Tensor | None:
-        """The vertical as a unit vector; None means z."""
+        """The unit vector (3,) that points up, in the frame of the cloud; None means the z axis.
+
+        Raises `BadArgument` for an --up of length zero.
+        """
         if self.up is None:
             return None
         vector = check_tensor("--up", real(self.up), (3,))
@@ -165,7 +168,8 @@ class CloudOptions(ViewOptions):
     def plane(self, cloud: PointCloud) -> Plane | float | None:
         """Return the table as a plane or as a height z [m]; None means no table.
 
-        By default the table is at the lowest point of the cloud that is no outlier.
+        By default the table is at the lowest point of the cloud that is no outlier. Raises
+        `BadArgument` for --table and --no-table together.
         """
         table = self.table
         if table is not None and self.no_table:
@@ -181,9 +185,10 @@ class CloudOptions(ViewOptions):
         return self._at(float((seen[:, 2] if up is None else seen.double() @ up).min()))
 
     def given_vertical(self, plane: Plane | None) -> Tensor | None:
-        """Return the unit vector of --up, else the normal of --table; None if neither is given.
+        """Return the unit vector (3,) of --up, else the normal of --table. Return None without
+        both.
 
-        `plane` is the table in the frame of the cloud.
+        Both point up. `plane` is the table in the frame of the cloud.
         """
         if self.up is not None or self.table is None or plane is None:
             return self.vertical
@@ -208,7 +213,8 @@ class CloudOptions(ViewOptions):
 def read_table(table: tuple[float, ...]) -> Plane | float:
     """Return the table as a plane, given four numbers, or as a height [m], given one.
 
-    Four numbers are a vector along the normal, of any length, and the offset d of n . p = d.
+    Four numbers are a vector n along the normal, of any length, and d. Points p [m] of the table
+    have n . p = d. Raises `BadArgument` for another count of numbers, or a normal of length zero.
     """
     if len(table) not in (1, 4):
         raise BadArgument(
@@ -227,7 +233,8 @@ def with_edge(table: Plane | float | None, edge: tuple[float, ...]) -> Plane:
     """Return a table, a plane or a height z [m], that ends at the edge of --edge.
 
     `edge` holds a point on the edge [m] and the direction away from the table. Each has x and y, or
-    x, y and z.
+    x, y and z. Raises `BadArgument` without a table, for another count of numbers, or for a
+    direction of length zero. With x and y alone, it is also raised if z is not up.
     """
     plane = as_plane(table)
     if plane is None:
@@ -272,7 +279,8 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
 def read_region(name: str, text: str | None) -> Region | None:
     """Return the region that the text of the option `name` describes; None for None.
 
-    The text holds six numbers, two corners of a box [m], or the path of a closed mesh [m].
+    The text holds six numbers, two corners of a box [m], or the path of a closed mesh [m]. Raises
+    `BadArgument` for another count of numbers.
     """
     with naming(mesh=name, low=name, high=name):
         try:

@@ -185,9 +185,11 @@ class Canvas:
     ) -> None:
         """Add an unshaded round table top; without a table nothing is added.
 
-        The `table` is level: its height z [m], or a plane. It is cut off at its edge. Its centre is
-        that of `corners` (n, 3) [m] in x and y. The `shadows` are meshes, by vertices (v, 3) [m]
-        and faces (t, 3), whose outlines darken the table straight below them.
+        `corners` (n, 3) [m] are points that the picture must show. The table top reaches a little
+        beyond their extent in x and y, and has the same centre. The `table` is level: its height z
+        [m], or a plane. If the plane ends at an edge, the table top ends there. The `shadows` are
+        meshes, by vertices (v, 3) [m] and faces (t, 3). Their outlines darken the table straight
+        below them.
         """
         plane = as_plane(table)
         if plane is None:
@@ -236,8 +238,9 @@ def frame_camera(
 ) -> Camera:
     """Return a camera in `direction` that sees all `corners` (n, 3) [m], with z up.
 
-    Its slope is limited by `FRAMING`. The lowest fraction `drop` of its picture stays empty; `size`
-    is the width and height of the picture [pixels].
+    The direction to it rises by 0.27 to 0.84 m (`FRAMING`) for each metre along the ground. A
+    steeper or flatter `direction` is changed. The lowest fraction `drop` of its picture stays
+    empty; `size` is the width and height of the picture [pixels].
     """
     tangent = np.tan(np.deg2rad(FRAMING.angle) / 2)
     x, y, z = direction
