@@ -39,8 +39,9 @@ from torchgrasp.ik.seeds import PostureLibrary, nearest_postures
 from torchgrasp.shape.completion.silhouette import Outlines
 from torchgrasp.shape.completion.symmetry import SymmetryScorer
 from torchgrasp.shape.conditioning import select_points
-from torchgrasp.shape.estimate import off_surface, on_surface
-from torchgrasp.shape.fit import fit_shape
+from torchgrasp.shape.estimate import Normalisation, off_surface, on_surface
+from torchgrasp.shape.fit import condition, fit_shape
+from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.kernel import kernel_by_name
 
 
@@ -286,15 +287,23 @@ def test_clearance_on_a_path(worlds, both, exact):
 
 
 @pytest.mark.parametrize("fingertips", [3, 4])
-@pytest.mark.parametrize("table", [0.0, None])
-def test_a_stage_of_the_contact_solver(shape, both, fingertips, table):
+@pytest.mark.parametrize(("table", "walls"), [(0.0, 1), (None, 1), (0.0, 2)])
+def test_a_stage_of_the_contact_solver(shape, both, fingertips, table, walls):
     """Sets that end, steps that are refused, and contacts outside their bounds are among them."""
+    if walls == 2:
+        inner = random(40, 3, seed=5)
+        cavity = on_surface(0.6 * unit(inner), -unit(inner), 0.01 + 0 * inner[:, 0], 0.05)
+        frame = Normalisation(shape.center, float(shape.scale))
+        shape = HollowShape.join(shape, condition(cavity, frame, shape.cloud), shape.cloud)
     spec = ContactSpec(table=table, fingertips=fingertips)
     problem = ContactProblem.of(shape, spec)
-    points = project(shape, 0.5 * unit(random(12, fingertips, 3)), 6)
+    begun = 0.5 * unit(random(12, fingertips, 3))
+    begun[::2] *= walls  # half of them on the outer wall
+    points = project(shape, begun, 6)
     stage = Stage(0.3, 3.0, 4, exact=False)
     wanted, found = both(lambda: descend(shape, problem, start_state(shape, points), stage))
     assert (wanted.points - points).abs().max() > 0.01
+    assert shape.wall_at(wanted.points.flatten(0, 1)).any(0).all()
     torch.testing.assert_close(found.points, wanted.points, rtol=0, atol=1e-7)
     torch.testing.assert_close(found.tension, wanted.tension, rtol=1e-6, atol=1e-7)
     for one, other in zip(

@@ -147,7 +147,8 @@ def test_setup_chooses_a_build_of_torch(set_up, tmp_path, needs, around, own_ind
     ), done.stderr
     assert (f"--index-url {INDEX}" in installs[0]) is own_index and "torch==" in installs[0]
     assert (
-        "--index-url" not in installs[1] and "-e .[cluster,data,dev,docs,fast,mujoco,sim]" in installs[1]
+        "--index-url" not in installs[1]
+        and "-e .[cluster,data,dev,docs,fast,mujoco,sim]" in installs[1]
     )
     done, installs = set_up()  # a second run does nothing
     assert done.returncode == 0 and installs == [] and done.stdout == ""

@@ -2,8 +2,8 @@
 contact sets.
 
 The loop computes the constraints of `ContactProblem`, and the steps of `levenberg_marquardt` with
-`Descent`. It takes stages that are not exact, on one shape with one surface and a thin-plate
-kernel. It takes neither a region nor an edge of the table.
+`Descent`. It takes stages that are not exact, on one shape with one surface or two walls, and a
+thin-plate kernel. It takes neither a region nor an edge of the table.
 """
 
 import collections
@@ -161,18 +161,30 @@ def _step(n, f, damping, weight, residual, jacobian, matrix, x):
 
 
 @inlined
-def _move(n, thin, pairs, signs, old, x, new):
+def _sum_walls(x, walls, bent):
+    """Return the sums of `sum_thin_plate` of the wall with the greater distance at a point x."""
+    y, a, b, psi = walls[0]
+    found = sum_thin_plate(x, y, a, b, psi, bent)
+    y, a, b, psi = walls[1]
+    if len(a):
+        other = sum_thin_plate(x, y, a, b, psi, bent)
+        if other[0] > found[0]:
+            found = other
+    return found
+
+
+@inlined
+def _move(n, walls, pairs, signs, old, x, new):
     """Write the contacts after a step, as `Descent.move`."""
-    y, a, b, psi = thin
     points, tension, distance, gradient, hessian, variance, _ = new
     f = len(points)
     for i in range(f):
         put(points[i], add(old[0][i], x[3 * i : 3 * i + 3], 1.0))
-        value, slope, _ = sum_thin_plate(points[i], y, a, b, psi, False)
+        value, slope, _ = _sum_walls(points[i], walls, False)
         newton = scale(slope, -value / dot(slope, slope))
         short = n.longest / max(math.sqrt(dot(newton, newton)), n.longest)
         put(points[i], add(points[i], newton, short))
-        distance[i], slope, curved = sum_thin_plate(points[i], y, a, b, psi, True)
+        distance[i], slope, curved = _sum_walls(points[i], walls, True)
         put(gradient[i], slope)
         put_hessian(hessian[i], curved)
         variance[i] = old[5][i] + dot(old[6][i], add(points[i], old[0][i], -1.0))
@@ -187,7 +199,7 @@ def _move(n, thin, pairs, signs, old, x, new):
 
 @compiled
 def _descend(
-    n, thin, pairs, signs, up, points, tension, distance, gradient, hessian, variance, slope
+    n, walls, pairs, signs, up, points, tension, distance, gradient, hessian, variance, slope
 ):
     """Minimise the cost of each contact set in place, as `levenberg_marquardt` with `Descent`."""
     b, f = points.shape[:2]
@@ -222,7 +234,7 @@ def _descend(
         for _ in range(n.steps):
             if not _step(n, f, damping, weight, residual, jacobian, matrix, x):
                 break
-            _move(n, thin, pairs, signs, old, x, new)
+            _move(n, walls, pairs, signs, old, x, new)
             inside = _constrain(n, new, pairs, signs, up, room, value, other)
             trial = _weigh(n, f, value, new_weight, new_residual)
             promised = 0.0
@@ -298,7 +310,14 @@ def descend(
         jet.variance_gradient,
     )
     new = [x.clone(memory_format=torch.contiguous_format) for x in fields]
-    y, a, b, psi = shape.weighted.arrays
-    thin = y, a[0], b[0], psi
-    _descend(numbers, thin, array(pairs, torch.int64), array(signs), up, *(x.numpy() for x in new))
+    walls = tuple(_thin_plate(wall) for wall in shape.walls)
+    if len(walls) == 1:
+        walls += ((np.empty((3, 0)), np.empty(0), np.empty((3, 0)), 1.0),)
+    _descend(numbers, walls, array(pairs, torch.int64), array(signs), up, *(x.numpy() for x in new))
     return solver.State(new[0], new[1], SurfaceJet(*new[2:]))
+
+
+def _thin_plate(wall: ShapeGP) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return the arrays of one surface that `sum_thin_plate` takes."""
+    y, a, b, psi = wall.weighted.arrays
+    return y, a[0], b[0], psi

@@ -39,6 +39,7 @@ from torchgrasp.geometry.optim import (
     levenberg_marquardt,
 )
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.kernel import is_thin
 from torchgrasp.shape.surface import newton_step
 
@@ -218,12 +219,15 @@ def descend(shape: ShapeLike, problem: ContactProblem, state: State, stage: Stag
 
 
 def _is_fused(shape: ShapeLike, problem: ContactProblem, state: State) -> TypeGuard[ShapeGP]:
-    """Return whether the compiled loop can compute. It can with one surface of a thin plate, and
-    without a region or an edge of the table.
+    """Return whether the compiled loop can compute. It can with thin plates, and without a region
+    or an edge of the table.
     """
-    if not (type(shape) is ShapeGP and is_fused(state.points, shape.x, shape.weights)):
+    if not (type(shape) is ShapeGP or type(shape) is HollowShape):
         return False
-    return is_thin(shape.kernel) and problem.beyond is None and len(problem.table) < 2
+    if not all(is_fused(state.points, wall.x, wall.weights) for wall in shape.walls):
+        return False
+    thin = all(is_thin(wall.kernel) for wall in shape.walls)
+    return thin and problem.beyond is None and len(problem.table) < 2
 
 
 def project(shape: ShapeLike, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:
