@@ -70,12 +70,12 @@ class DraftNumbers:
     most_slide_stiffness: float = 1e4  # [N/m]
     damping: float = 0.03  # least time constant [s]: the ratio of damping to stiffness
     trials: int = 1000  # random postures of each set of fingers in which a free one is sought
-    # Pairs of links are left out if fewer than this share of postures is free. They are pairs that
-    # meet in these shares or more. Their shapes are too coarse. Real fingers do not meet themselves
-    # so often.
+    # If fewer than this share of postures is free of self-collision, pairs of links that collide
+    # often are no longer tested. Their shapes are too coarse: real fingers seldom meet.
     least_free: float = 0.02
-    most_within: float = 0.25  # pairs of one finger
-    most_between: float = 0.5  # other pairs
+    # least share of postures in which such a pair collides
+    most_within: float = 0.25  # of links of one finger
+    most_between: float = 0.5  # of other links
     listed: int = 5  # most pairs that a warning names
     thin: float = 6e-3  # a fingertip thinner than this [m] may be no fingertip
 

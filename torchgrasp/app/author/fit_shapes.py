@@ -152,8 +152,9 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
 def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tuple[Urdf, list[str]]:
     """Return the URDF with a few boxes or a cylinder instead of every mesh, and a sentence on it.
 
-    `points` (n, 3) [m] on every shape are those of `shape_points`. The sentence holds the counts;
-    it is the only one in a list, which is empty without meshes.
+    `points`, from `shape_points`, holds by link an array (n, 3) [m] for each of its shapes. They
+    are in the link's frame. The sentence holds the counts; it is the only one in a list, which
+    is empty without meshes.
     """
     links = []
     count = 0
@@ -321,8 +322,9 @@ def turned_shape(
 ) -> LinkShape:
     """Return a collision shape with rounded numbers.
 
-    `turn` (3, 3) holds its axes as columns, `center` (3,) [m] is its middle, both in the frame of
-    its link. `kind` and `size` are those of `LinkShape`.
+    `kind` is "box", "cylinder" or "sphere". `size` [m] is the three sides, (radius, length), or
+    (radius,). `turn` (3, 3) holds its axes as columns; a cylinder lies along the third. `center`
+    (3,) [m] is its middle. Both are in the frame of its link.
     """
     pose = np.eye(4)
     pose[:3, :3] = turn

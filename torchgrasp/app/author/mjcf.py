@@ -48,9 +48,10 @@ def read_mjcf(
     """Return an MJCF as a URDF, whose meshes are written to `folder`.
 
     All files of the MJCF lie below the folder `meshes`; None means its own. `root` names a body of
-    the hand, if the file has more; "" if not. `tips` are sites or bodies that the user chose. With
-    `visual`, bodies without collision geoms take their visual ones. Raises `HandFileError` for a
-    file that is refused, and `MissingExtra` without MuJoCo.
+    the hand, if the file has several hands; "" if not. `tips` are names of sites or bodies that the
+    user chose as fingertips. With `visual`, bodies without collision geoms take their visual ones.
+    Raises `HandFileError` for a file that is malformed, too large, or more than a URDF can say.
+    Raises `MissingExtra` without MuJoCo.
     """
     mujoco = import_mujoco()
     safe = read_mjcf_text(path, meshes)

@@ -29,11 +29,16 @@ class Drive:
 
 
 class ModelHand:
-    """The part of a compiled model that is a hand, and its joints.
+    """The part of a compiled MuJoCo model that is a hand, and its joints; `choose` finds them.
+
+    Args:
+        mujoco: the module `mujoco`.
+        model: the compiled model, an `MjModel`.
+        path: path of the MJCF, which errors name.
 
     Attributes:
         bodies: indices of the bodies of the hand, parents first; a world body that is kept is 0.
-        joints: indices of their joints of one coordinate, in the order of the bodies.
+        joints: indices of their hinge and slide joints, in the order of the bodies.
         root: index of the body at the root of the hand; 0 for the world.
         on_world: whether the fingers are fixed to the world, whose shapes are then the palm.
         parents, names: the parent's index and the name of each body of the model.
@@ -68,8 +73,15 @@ class ModelHand:
         return HandFileError("mjcf", f"{self.path}: {found}", allowed)
 
     def choose(self, root: str) -> None:
-        """Choose the bodies of the hand. They are all below its first body, or those below several
-        bodies of the world that move.
+        """Choose the bodies of the hand, and the joints between them.
+
+        They hang on the bodies fixed to the world that carry the joints with an actuator. If one
+        body carries these joints, it is the root of the hand, unless it moves itself. Otherwise the
+        world is the root, with its bodies that stand still as the palm. `root` names a body of the
+        hand if the model has several hands; "" if not.
+
+        Raises `HandFileError` for several hands without a `root`, for a hand without an actuator,
+        and for ball joints. Raises `BadArgument` for an unknown `root`.
         """
         tops = self._tops()
         every = range(1, self.model.nbody)
@@ -131,7 +143,10 @@ class ModelHand:
                 raise self.refuse(found, "hinges and slides: three hinges for a ball joint")
 
     def own_joints(self, body: int) -> list[int]:
-        """Return the joints of one coordinate between a body and its parent."""
+        """Return the indices of the hinge and slide joints between a body and its parent.
+
+        `body` is the index of the body in the model.
+        """
         own = [j for j, owner in enumerate(self.owners) if owner == body]
         return [j for j in own if self.scalar[j]]
 
@@ -185,10 +200,11 @@ class ModelHand:
         return row
 
     def couple(self) -> Mechanism:
-        """Return which joints of the hand lead, follow or stand still.
+        """Return which joints of the hand lead, which follow others, and which stand still.
 
-        Raises `HandFileError` for actuators, tendons or equalities of another kind. It is also
-        raised for equalities that contradict each other.
+        Actuators may drive joints and fixed tendons; equalities may tie them by straight lines.
+        Raises `HandFileError` for others that move the hand, such as spatial tendons or a closed
+        loop of bodies. Raises it also for equalities that contradict each other.
         """
         model = self.model
         own = self.joints
@@ -333,9 +349,9 @@ class ModelHand:
         self.told.append(f"equality {name} to a body beside the hand is left out")
 
     def drives(self, mechanism: Mechanism) -> dict[int, Drive]:
-        """Return limits and effort of every joint of the hand, by its index.
+        """Return limits and effort of every joint of the hand, by its index in the model.
 
-        `mechanism` says which joints lead and how the others follow.
+        `mechanism`, from `couple`, says which joints lead and how the others follow.
         """
         pulls = self._pulls()
         model = self.model
@@ -513,7 +529,7 @@ class ModelHand:
         return arms, shift
 
     def tip_links(self) -> tuple[str, ...]:
-        """Return the links with a site whose name says that it is at a fingertip. Return () if they
+        """Return the names of the links with a site whose name contains "tip". Return () if they
         are not three to five.
         """
         model = self.model
@@ -535,14 +551,20 @@ class ModelHand:
 
 
 def names_of(model: Any, kind: str, count: int) -> list[str]:
-    """Return the names of all elements of a kind; one without a name gets one of its own."""
+    """Return the names of all elements of a kind, such as "body", in the order of the model.
+
+    `count` is their number. An element without a name gets a new one, such as "body_3".
+    """
     given = [getattr(model, kind)(k).name for k in range(count)]
     taken = set(given)
     return [name or unused_name(f"{kind}_{k}", taken) for k, name in enumerate(given)]
 
 
 def unused_name(name: str, taken: set[str]) -> str:
-    """Return a name that is not taken, and add it to the taken ones."""
+    """Return a name that is not in `taken`, and add it there.
+
+    It is `name`, with as many underscores behind it as are needed.
+    """
     while name in taken:
         name += "_"
     taken.add(name)

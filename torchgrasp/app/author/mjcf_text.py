@@ -55,11 +55,10 @@ refuse = functools.partial(HandFileError, "mjcf")  # the error of this gate, as 
 
 
 class SafeMjcf(NamedTuple):
-    """The name and the checked text of an MJCF. Also its meshes by the names in the text, and what
-    is left out.
+    """The checked content of an MJCF, a model file of MuJoCo: the name of the model, and the text.
 
-    `left_out` holds the tags of elements on a hand's motion or touch that this library does not
-    use.
+    `meshes` holds the bytes of each mesh file, by its name in the text. `left_out` holds the tags
+    of elements that were taken out although they bear on a hand's motion or touch.
     """
 
     name: str
@@ -69,9 +68,11 @@ class SafeMjcf(NamedTuple):
 
 
 def is_mjcf(path: Path) -> bool:
-    """Return whether a file ends in .xml or .mjcf and its first element is <mujoco>.
+    """Return whether a file ends in .xml or .mjcf and its first element is <mujoco> or
+    <mujocoinclude>.
 
-    The file itself is judged by `read_mjcf_text`.
+    It may still be malformed: only `read_mjcf_text` checks that. A file that cannot be read gives
+    False.
     """
     if path.suffix.lower() not in (".xml", ".mjcf"):
         return False
@@ -86,12 +87,13 @@ def is_mjcf(path: Path) -> bool:
 
 
 def read_mjcf_text(path: Path, base: Path | None = None) -> SafeMjcf:
-    """Read an MJCF with its included files and meshes, all of which lie below the folder `base`.
+    """Return the checked content of an MJCF with its included files and meshes.
 
-    By default this is the folder of the file.
+    All files must lie below the folder `base`; None means the folder of the MJCF.
 
     Raises `HandFileError` for files that are missing, outside, malformed or too large. Raises it
-    also for elements that make many bodies or read other models.
+    also for <replicate> and <composite>, which make many bodies. The same is raised for <attach>
+    and <model>, which read other models.
     """
     left = Counter[str]()
     spot = _Spot(path, (base or path.parent).resolve())

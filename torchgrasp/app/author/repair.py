@@ -120,9 +120,11 @@ def merge_markers(
 ) -> tuple[Urdf, list[str], dict[str, str]]:
     """Return the URDF with markers at fingertips merged into the links to which they are fixed.
 
-    A marker is too small to touch an object, as those by which a hand is calibrated. Its mass is
-    kept, and its shapes are left out. `surfaces` holds points (n, 3) [m] on each link, by its name,
-    in its frame. The other results are those of `merge_frames`.
+    A marker is a link smaller than 6 mm (`REPAIRS.marker`), too small to touch an object. Some
+    hands have markers for calibration. Its mass is kept, and its shapes are left out. `surfaces`
+    holds points (n, 3) [m] on each link, by its name, in its frame. The second result is a list of
+    one sentence on the markers, or none. The third gives for each of them the link that took it
+    over.
     """
     taken: dict[str, str] = {}
     while marker := _marker(urdf, surfaces):
@@ -212,8 +214,9 @@ def _moved(link: Link, pose: np.ndarray) -> Link:
 def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
     """Return the URDF with the wrist joints fixed at their rest positions, and a sentence on it.
 
-    Wrist joints move all the links `tips`. More than `REPAIRS.most_wrist` such joints are an arm,
-    which is cut off. The list of sentences is empty if there is no such joint.
+    Wrist joints move all the links `tips`. More than three of them (`REPAIRS.most_wrist`) are an
+    arm, which is cut off. Rest positions are zero, or the limit nearest to zero. The list of
+    sentences is empty if there is no such joint.
     """
     movers = urdf.movers(tips[0]) if len(tips) > 2 else []
     common = [j for j in movers if all(j in urdf.movers(tip) for tip in tips)]
@@ -259,8 +262,10 @@ def _fixed(joint: Joint, value: float) -> Joint:
 def repair_joints(urdf: Urdf) -> Step:
     """Return the URDF with complete limits of all joints, and a sentence for each repair.
 
-    Missing limits of position, effort and velocity are added. Coupled joints follow independent
-    ones, within limits. Raises `HandFileError` for a sliding joint without limits.
+    Missing limits of position, effort and velocity are added. A joint that follows a follower then
+    follows an independent joint. Ranges of independent joints are narrowed so that their followers
+    keep their own limits. Raises `HandFileError` for a sliding joint without limits, and for a
+    follower that cannot keep its limits.
     """
     joints = {j.name: j for j in urdf.joints}
     done = (
@@ -396,6 +401,8 @@ def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
     """Return the URDF without missing or impossible masses and inertias, and sentences on the
     repair.
 
+    A link without mass gets that of water in half its bounding box. An inertia or mass centre is
+    impossible if no body of the link's size and mass has it. It becomes that of the bounding box.
     `surfaces` holds points (n, 3) [m] on each link, by its name, in its frame.
     """
     links = []

@@ -21,10 +21,10 @@ LOOKS = ("bind_material", "extra", "instance_camera", "instance_light")  # parts
 
 
 def clean_dae(data: bytes) -> tuple[bytes, float]:
-    """Return a COLLADA file with its geometry alone, and the size of its unit [m].
+    """Return the bytes of a COLLADA file (.dae) with its geometry alone, and its length unit [m].
 
-    Its axes stay as they are, as in ROS. Raises `Malformed` for declarations, for skins, and for
-    nodes that repeat others; `MissingExtra` without pycollada.
+    Its axes stay as they are, as in ROS. Raises `Malformed` for a DOCTYPE or ENTITY, for skins, for
+    nodes that repeat others, and for too many corners. Raises `MissingExtra` without pycollada.
     """
     if importlib.util.find_spec("collada") is None:
         raise MissingExtra("pycollada", "meshes")
@@ -59,7 +59,8 @@ def clean_dae(data: bytes) -> tuple[bytes, float]:
 def check_glb(data: bytes) -> None:
     """Raise `Malformed` for a .glb file with skins, compressed geometry, or too many corners.
 
-    At most `MOST_INDICES` corners are allowed, where a mesh counts once for each node that uses it.
+    `data` holds the bytes of the file. At most 6 million corners (`MOST_INDICES`) are allowed. A
+    mesh counts once for each node that uses it.
     """
     if not data.startswith(MAGIC):
         raise Malformed("no header of a .glb file")

@@ -41,8 +41,12 @@ def extend_pads(
     """Return the pads of fingertips with sensor tips; a finger of offset 0 keeps its pad.
 
     `guess` holds the pads of the links `tips`, and the directions along which they are offset.
-    `offsets` and `radii` [m] are those of `Wish`; `named` says whether the user gave the tips.
-    Raises `BadArgument` for a wrong count or length, and for a flat tip without a radius.
+    `offsets` [m] are the lengths by which sensors extend the tips; without any, no pad changes.
+    `radii` [m] are those of the sensors' balls; without any, those of the guessed pads. Each has
+    one number for all tips or, if the user `named` the tips, one for each.
+
+    Raises `BadArgument` for a wrong count of numbers, or a length or radius outside its bounds.
+    Raises it also for a flat pad without a radius.
     """
     if not offsets:
         if radii:
@@ -92,7 +96,7 @@ class Sensor(NamedTuple):
 
     @property
     def turn(self) -> np.ndarray:
-        """The axes (3, 3) of the cylinder as columns; the third points along it."""
+        """The axes (3, 3) of the cylinder as columns, in the link's frame; the third is `way`."""
         flat = np.eye(3)[int(np.abs(self.way).argmin())]
         one = np.cross(flat, self.way)
         one /= np.linalg.norm(one)
@@ -143,9 +147,10 @@ def add_sensors(urdf: Urdf, sensors: Sequence[Sensor]) -> tuple[Urdf, list[str]]
 def add_seen_sensors(
     seen: Mapping[str, Triangles], sensors: Sequence[Sensor]
 ) -> dict[str, Triangles]:
-    """Return the visual meshes by link [m], each with a capsule for its sensor tip.
+    """Return the visual meshes of links, each with a capsule for its sensor tip.
 
-    `seen` are the meshes without sensors; a link that is not among them gets none.
+    `seen` holds the meshes without sensors by link: corners (v, 3) [m] in the link's frame, and
+    faces (t, 3). A link without a mesh there gets no capsule.
     """
     shown = dict(seen)
     for sensor in sensors:

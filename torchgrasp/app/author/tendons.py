@@ -34,8 +34,9 @@ TENDONS = TendonNumbers()
 class Joints(NamedTuple):
     """The n joints of a mechanism: names, and springs and dampers by which they give way.
 
-    `stiffness` [N m/rad], `damping` [N m s/rad], `spring` and `rest` [rad] (or with [N] and [m])
-    are those of each joint. `spring` is where its spring is at rest, `rest` where the file has it.
+    A sliding joint has units with [N] and [m] in place of [N m] and [rad]. `stiffness` [N m/rad] is
+    that of each joint's spring, and `damping` [N m s/rad] that of its damper. `spring` [rad] is the
+    position at which the spring is relaxed. `rest` [rad] is that in the model's initial posture.
     """
 
     names: tuple[str, ...]
@@ -48,8 +49,9 @@ class Joints(NamedTuple):
 class Mechanism(NamedTuple):
     """How the joints of a hand move: every joint leads, follows or stands still.
 
-    `followers` are coupled joints by name, and `still` the positions [rad or m] of joints that
-    nothing moves. `told` has a sentence for each choice.
+    Motors set the positions of the leading joints. `followers` holds, by name, how each following
+    joint depends on leading ones. `still` holds, by name, the positions [rad or m] of joints that
+    nothing moves. `told` has a sentence on each choice for the user.
     """
 
     followers: dict[str, Mimic]
@@ -71,11 +73,11 @@ def couple_joints(
     values: Float[np.ndarray, "m"],
     pulls: Float[np.ndarray, "k n"],
 ) -> Mechanism:
-    """Return which joints lead, and how the others follow.
+    """Return which of n joints lead, and how the others follow.
 
-    The equalities are `equal @ q = values`; a motor sets each row of `pulls @ q`. Joints with a
-    motor of their own lead before others. Raises `Contradiction` for equalities that no posture
-    obeys.
+    The positions q (n,) [rad or m] of the joints obey m equalities, `equal @ q = values`. Each of k
+    motors sets one sum over the joints, an entry of `pulls @ q`. Joints with a motor of their own
+    are the first choice to lead. Raises `Contradiction` for equalities that no posture obeys.
     """
     followers = dict[str, Mimic]()
     still = dict[str, float]()

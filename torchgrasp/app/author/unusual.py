@@ -44,10 +44,12 @@ USUAL = UsualNumbers()
 
 
 def find_unusual(urdf: Urdf, points: Mapping[str, Sequence[np.ndarray]]) -> list[str]:
-    """Return a sentence for each kind of number of a URDF that no hand has.
+    """Return a warning for each kind of number in a URDF that is outside the range of usual hands.
 
-    `points` (n, 3) [m] are those on every shape of each link, by its name, in its frame. Numbers
-    that the URDF lacks are not named. Another sentence names soft limits, which are not read.
+    The kinds are sizes, distances, masses, densities, and the joints' ranges, efforts and
+    velocities. `points` holds, by link, an array (n, 3) [m] of points on each of its shapes, in the
+    link's frame. Numbers that the URDF lacks are not judged. One more warning names joints with
+    narrower soft limits, which the library ignores.
     """
     sizes = []
     dense = []

@@ -25,9 +25,10 @@ class VisualNumbers:
     """Bounds of the visual meshes of a hand."""
 
     most_faces: int = 2000  # triangles of a link: more are not seen in a picture of a hand
-    first_cell: float = 5e-4  # edge of the cells [m] in which corners are joined, where too many
-    growth: float = 1.3  # by which cells grow until few triangles are left
-    letters: int = 60  # most of a link's name in the name of a file
+    # edge of the first grid cells [m] in which corners are joined if there are too many triangles
+    first_cell: float = 5e-4
+    growth: float = 1.3  # factor by which the cells grow until few enough triangles are left
+    letters: int = 60  # most letters of a link's name in the name of a file
 
 
 VISUAL = VisualNumbers()
@@ -37,10 +38,12 @@ Triangles = tuple[Float[np.ndarray, "_ 3"], np.ndarray]  # corners [m], and face
 
 @functools.lru_cache(maxsize=16)
 def link_meshes(path: Path, data: bytes, folder: Path) -> dict[str, Triangles]:
-    """Return corners [m] and faces by link, in its frame, for each link of which all visuals are
-    read.
+    """Return one mesh for the <visual> elements of each link, by the name of the link.
 
-    `path` and `data` are those of the URDF; mesh files lie inside `folder`.
+    A mesh is its corners (v, 3) [m] in the link's frame, and the indices (t, 3) of the corners of
+    its faces. Where it has too many faces, near corners are joined. A link is left out if one of its
+    visuals is missing, malformed or too large. `path` and `data` are the path and the bytes of the
+    URDF; mesh files lie inside `folder`.
     """
     found = {}
     size = 0
@@ -66,10 +69,13 @@ def link_meshes(path: Path, data: bytes, folder: Path) -> dict[str, Triangles]:
 def keep_visuals(
     published: Urdf, clean: Urdf, mergers: Sequence[Mapping[str, str]], folder: Path
 ) -> dict[str, Triangles]:
-    """Return corners [m] and faces of the visuals of each link of a clean URDF, in its frame.
+    """Return the visual meshes of a published URDF for the links of its repaired copy `clean`, by
+    link.
 
-    `mergers` give for each link that was merged the link that took it over, in the order of the
-    merging. Frames of links that stay are those of the published URDF.
+    A mesh is its corners (v, 3) [m] in the frame of the link, and its faces (t, 3). Each of the
+    `mergers` gives, for every link that was merged, the link that took it over. They are in the
+    order of merging. Links that stay have the same frames in both URDFs. Mesh files lie inside
+    `folder`. A link with a missing or malformed visual is left out.
     """
     names = {link.name for link in clean.links}
     meshes = link_meshes(published.path, published.data, folder)
@@ -99,7 +105,11 @@ def keep_visuals(
 
 
 def mesh_files(meshes: Mapping[str, Triangles]) -> dict[str, tuple[str, bytes]]:
-    """Return by link the name and the bytes of a file, binary STL, of its corners and faces."""
+    """Return for each link, by its name, the path and the bytes of a mesh file, binary STL.
+
+    `meshes` holds corners (v, 3) [m] and faces (t, 3) by link. The path is relative to the URDF.
+    Nothing is written.
+    """
     files = {}
     for number, (link, (vertices, faces)) in enumerate(meshes.items()):
         word = re.sub(r"[^A-Za-z0-9_.-]", "_", link)[: VISUAL.letters]

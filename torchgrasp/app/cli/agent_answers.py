@@ -12,7 +12,10 @@ DIGITS = 6  # decimals of numbers in answers [m, rad]: micrometres
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What a tool answers. `picture`, the bytes of a PNG, is no part of its text."""
+    """Base of the answers of the tools for agents.
+
+    `picture` holds the bytes of a PNG, or None; it is sent beside the other fields, not as text.
+    """
 
     notes: tuple[str, ...] = option((), "what was noticed, such as advice for a better cloud")
     picture: bytes | None = dataclasses.field(default=None, repr=False)
@@ -20,7 +23,7 @@ class Answer:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GraspRow:
-    """An executable grasp: poses [m] in the frame of the cloud, joints [rad] by name."""
+    """A grasp that passed all checks: pose [m] in the frame of the cloud, joints [rad] by name."""
 
     rank: int = required("0 is the best")
     success: float | None = required(
@@ -45,7 +48,7 @@ class GraspRow:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ThingRow:
-    """An object of a scene."""
+    """An object of a scene, and what planning found for it."""
 
     label: int = required("label of the object")
     success: float | None = required("predicted success of its best grasp; null if it is unknown")
@@ -86,7 +89,7 @@ class PlanAnswer(Answer):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LossRow:
-    """A stage of planning and what it lost."""
+    """A stage of planning, and how many candidates, such as postures, it lost and why."""
 
     stage: str = required("name of the stage")
     given: int = required("number of things that it was given")
@@ -97,7 +100,7 @@ class LossRow:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ChangeRow:
-    """A change that was tried by planning with it."""
+    """A change of the options or of the world, and the grasps that planning found with it."""
 
     change: str = required("the change in words")
     choice: bool = required("whether the user can make it; otherwise it changes the world")
@@ -193,7 +196,10 @@ class HealthAnswer(Answer):
 
 
 def plain_answer(answer: Answer) -> dict[str, Any]:
-    """Return an answer without its picture as values of JSON; NaN and infinity are null."""
+    """Return the fields of an answer, but for its picture, as a dict for JSON.
+
+    Numbers are rounded to 6 decimals; NaN and infinity become None.
+    """
     fields = dataclasses.fields(answer)
     named = {field.name: getattr(answer, field.name) for field in fields}
     named.pop("picture")

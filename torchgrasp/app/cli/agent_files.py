@@ -12,10 +12,10 @@ from torchgrasp.hand.load import list_hands
 
 @dataclasses.dataclass(frozen=True)
 class Workplace:
-    """The folder of all files that tools read and write; `root` is its path without links.
+    """The folder of all files that tools read and write; `root` is its path without symbolic links.
 
-    Arguments of tools name files by a path below it. The names of shipped hands and objects are
-    allowed, too.
+    Arguments of tools name files by a path relative to it. The names of shipped hands and objects
+    are allowed, too.
     """
 
     root: Path
@@ -28,10 +28,10 @@ class Workplace:
         return cls(folder.resolve())
 
     def place(self, name: str, text: str) -> Path:
-        """Return the path below the folder that a text names, whether it exists or not.
+        """Return the path below the folder that the relative path `text` names; it need not exist.
 
-        Raises `BadArgument`, which calls the argument by `name`, for a path out of the folder.
-        Raises it also for `..`, and for a link that leads out of it.
+        Raises `BadArgument`, which calls the argument `name`, for a path out of the folder. Raises
+        it also for `..`, and for a symbolic link that leads out of the folder.
         """
         check_path(name, text)
         path = self.root / text
@@ -45,24 +45,37 @@ class Workplace:
         return path
 
     def file(self, name: str, text: str) -> Path:
-        """Return the path of a file below the folder; raise `BadArgument` if there is none."""
+        """Return the path of the file below the folder that the relative path `text` names.
+
+        Raises `BadArgument`, which calls the argument `name`, if there is no such file.
+        """
         path = self.place(name, text)
         if not path.is_file():
             raise BadArgument(name, repr(text), f"a file below {self.root}")
         return path
 
     def cloud(self, name: str, text: str) -> Path:
-        """Return the path of a cloud below the folder, or of the view of a shipped object."""
+        """Return the path of a cloud: of a file below the folder, or of a shipped object's view.
+
+        `text` is a relative path, or the object's name. Raises `BadArgument`, which calls the
+        argument `name`, if there is no such file.
+        """
         return find_view(Path(text)) if text in list_objects() else self.file(name, text)
 
     def mesh(self, name: str, text: str) -> Path:
-        """Return the path of a mesh below the folder, or of the mesh of a shipped object."""
+        """Return the path of a mesh: of a file below the folder, or of a shipped object.
+
+        `text` is a relative path, or the object's name. Raises `BadArgument`, which calls the
+        argument `name`, if there is no such file.
+        """
         return DATA / text / "mesh.ply" if text in list_objects() else self.file(name, text)
 
     def hand(self, name: str, text: str) -> str:
-        """Return the name of a shipped hand, or the folder of another hand below this folder.
+        """Return the name of a shipped hand, or the path of another hand's folder.
 
-        Raises `BadArgument` if a link in the hand's folder leads out of this folder.
+        `text` is this name, or the path of the hand's folder relative to `root`. Raises
+        `BadArgument`, which calls the argument `name`, for a path out of `root`. Raises it also if
+        a symbolic link in the hand's folder leads out of `root`.
         """
         if text in list_hands():
             return text
@@ -72,9 +85,13 @@ class Workplace:
         return str(folder)
 
     def out(self, text: str | None, source: Path) -> Path:
-        """Return the folder that results are written to: by default out/ and the object's name."""
+        """Return the path of the folder for results, which need not exist.
+
+        `text` is its path relative to `root`. None means out/NAME, where NAME is that of the object
+        in the file `source`. Raises `BadArgument` for a path out of `root`.
+        """
         return self.place("out", f"out/{object_name(source)}" if text is None else text)
 
     def tell(self, path: Path) -> str:
-        """Return the path of a file below the folder as an agent names it."""
+        """Return a path below the folder as agents name it: relative to `root`, with slashes."""
         return path.relative_to(self.root).as_posix()

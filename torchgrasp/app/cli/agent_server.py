@@ -50,10 +50,10 @@ would help."""
 
 
 def serve(folder: Path, http: int | None, seconds: float) -> int:
-    """Serve until the client ends the session, or until a signal; return the exit code.
+    """Offer the library as tools to agents, by the Model Context Protocol; return the exit code 0.
 
-    Raises `MissingExtra` without the package `mcp`, and `BadArgument` for a folder or port that
-    cannot be used.
+    The server ends when the client ends the session, or at a signal. Raises `MissingExtra` without
+    the package `mcp`, and `BadArgument` for a folder or port that cannot be used.
 
     Args:
         folder: the folder of all files that tools read and write.
@@ -122,7 +122,7 @@ class AgentServer:
         )
 
     async def serve_stdio(self) -> None:
-        """Serve the process that started this one, by stdin and stdout."""
+        """Serve the agent that started this process, by stdin and stdout, until stdin ends."""
         stdio: Any = importlib.import_module("mcp.server.stdio")
         # What libraries print goes to stderr: the SDK moves the descriptor of stdout.
         async with stdio.stdio_server() as (reader, writer):
@@ -130,7 +130,7 @@ class AgentServer:
             await self.server.run(reader, writer, options)
 
     async def serve_http(self, port: socket.socket) -> None:
-        """Serve programs of this machine by HTTP on a bound socket."""
+        """Serve agents of this machine by HTTP on the bound socket `port`, until a signal."""
         uvicorn: Any = importlib.import_module("uvicorn")
         security: Any = importlib.import_module("mcp.server.transport_security")
         number = port.getsockname()[1]
@@ -149,7 +149,10 @@ class AgentServer:
         await uvicorn.Server(config).serve(sockets=[port])
 
     async def list_tools(self, context: Any, params: Any) -> Any:
-        """Return all tools with the schemas of their arguments and answers."""
+        """Return all tools with the JSON schemas of their arguments and answers.
+
+        The package `mcp` calls it; `context` and `params` are not used.
+        """
         listed = [
             self.types.Tool(
                 name=name,
@@ -165,7 +168,11 @@ class AgentServer:
         return self.types.ListToolsResult(tools=listed)
 
     async def call_tool(self, context: Any, params: Any) -> Any:
-        """Do the work of a tool, and return its answer, or the error as one sentence."""
+        """Run a tool, and return its answer, or its error as one sentence, in the form of MCP.
+
+        The package `mcp` calls it. `params` holds the `name` of the tool and its `arguments`.
+        `context` is the client's session.
+        """
         try:
             tool = make_tool(params.name, dict(params.arguments or {}))
             if isinstance(tool, TellHealth):
@@ -183,9 +190,11 @@ class AgentServer:
         return self.types.CallToolResult(content=content, structured_content=plain_answer(answer))
 
     async def work(self, context: Any, tool: Tool) -> Answer:
-        """Return the answer of a tool, which works in another process, when it is its turn.
+        """Run a tool in another process, one tool at a time, and return its answer.
 
-        Raises the errors of the tool, and `BadArgument` if it takes too long.
+        `context` is the client's session, to which progress is reported. Raises the `GraspError` of
+        the tool, and one if its process dies. Raises `BadArgument` after the longest time of a
+        call.
         """
         outcome: Answer | GraspError | None = None
         async with self.turn, self.anyio.create_task_group() as group:
@@ -225,9 +234,9 @@ class AgentServer:
 def do_work(tool: Tool, place: Workplace) -> Answer:
     """Run a tool, and return its answer with the library's warnings among the notes.
 
-    It runs in a worker process. `place` is the folder in which the tool reads and writes files.
-    Errors of the library pass. For any other error, the traceback is written to stderr, and
-    `GraspError` is raised.
+    It runs in a process of its own. `place` is the folder in which the tool reads and writes files.
+    Raises `GraspError`, also in place of an error that is no `GraspError`. The traceback of the
+    latter is written to stderr.
     """
     with _stdout_elsewhere(), warnings.catch_warnings(record=True) as heard, naming(**NAMES):
         warnings.simplefilter("always", UserWarning)
@@ -296,8 +305,11 @@ def _stdin_that_ends() -> Iterator[None]:
 
 
 def say(told: GraspError | str) -> str:
-    """Return an error or advice as one line. Options of the command line become the arguments of a
-    tool.
+    """Return an error or advice as one line, in which an option such as --depth-unit becomes
+    depth_unit.
+
+    So it names the arguments of a tool. A line with a whole command line, as `torchgrasp grasp
+    jug`, keeps its options.
     """
     line = one_line(told)
     if LIBRARY in line:
@@ -306,7 +318,9 @@ def say(told: GraspError | str) -> str:
 
 
 def make_schema(kind: Any) -> dict[str, Any]:
-    """Return the JSON schema of a type: of a dataclass with the help of its fields.
+    """Return the JSON schema of a type, as a dict.
+
+    Of a dataclass, it has the fields with a help text, each described by this text.
 
     >>> make_schema(tuple[float, float] | None)["anyOf"][0]["maxItems"]
     2

@@ -140,12 +140,19 @@ MESH_HELP = "closed mesh [m] (.ply, .obj, .stl, .off), or the name of a shipped 
 
 
 def law_of(name: str, given: float | str) -> float | Distribution:
-    """Return the number or the distribution that the argument `name` gives."""
+    """Return the value of a tool's argument as a number or a distribution.
+
+    A text is read, such as "0.3:0.8" for an interval and "0.2|0.8" for one of both. Raises
+    `BadArgument`, which calls the argument `name`, for another text.
+    """
     return read_distribution(name, given) if isinstance(given, str) else given
 
 
 def region_of(name: str, box: Box | None) -> Region | None:
-    """Return the box [m] that the argument `name` gives as a region; None for None."""
+    """Return the region of space inside a box; None for None.
+
+    `box` holds two opposite corners [m] in the frame of the cloud. Errors call it `name`.
+    """
     if box is None:
         return None
     low, high = real(box).split(3)
@@ -154,10 +161,10 @@ def region_of(name: str, box: Box | None) -> Region | None:
 
 
 class Tool:
-    """Base of all tools; the fields of a tool are its arguments."""
+    """Base of all tools that agents may call; the fields of a tool are its arguments."""
 
     def run(self, place: Workplace) -> Answer:
-        """Do the work in the folder of a workplace, and return the answer."""
+        """Do the work, and return the answer. All files are in the folder `place`."""
         raise NotImplementedError
 
 
@@ -364,7 +371,7 @@ class PlanFromCloud(_PlanTool, _SeenTool):
     """
 
     def run(self, place: Workplace) -> PlanAnswer:
-        """Plan on the cloud, and return the answer."""
+        """Plan on the cloud, and return the answer. All files are in the folder `place`."""
         path = place.cloud("cloud", self.cloud)
         out = place.out(self.out, path)
         seen = self.see(place, path)
@@ -404,7 +411,10 @@ class PlanFromDepth(_PlanTool):
     table: tuple[float, ...] | None = option(None, DEPTH_HELP["table"])
 
     def run(self, place: Workplace) -> PlanAnswer:
-        """Find the objects, plan on the chosen or the easiest one, and return the answer."""
+        """Find the objects, plan on the chosen or the easiest one, and return the answer.
+
+        All files are in the folder `place`.
+        """
         path = place.file("depth", self.depth)
         out = place.out(self.out, path)
         scene = self.see(place, path)
@@ -420,7 +430,11 @@ class PlanFromDepth(_PlanTool):
         return dataclasses.replace(answer, seen_file=place.tell(file))
 
     def see(self, place: Workplace, path: Path) -> Scene:
-        """Return the scene that the image shows."""
+        """Return the scene that the depth image at `path` shows: its table and its objects.
+
+        The folder `place` has the other files that the arguments name. Raises `BadArgument` for an
+        unusable image, and `NoSupport` without a plane on which objects stand.
+        """
         known = self.intrinsics
         if isinstance(known, str):
             camera = (str(place.file("intrinsics", known)),)
@@ -454,7 +468,12 @@ class PlanFromDepth(_PlanTool):
     def choose(
         self, place: Workplace, seen: _Seen, scene: Scene, out: Path, file: Path
     ) -> PlanAnswer:
-        """Plan on all objects until one is easy, and return the answer with the best of them."""
+        """Plan for the objects in turn until one is easy, and return the answer for the best one.
+
+        It is easy if its predicted success is at least 0.9 (`ENOUGH`). `seen` is the `scene` with
+        notes. The scene is written to `file`, and the results to the folder `out`. All files are
+        below the folder `place`.
+        """
         hand, among = self.load(place)
         spec = ContactSpec(friction=self.law)
         options = {"fingers": among, "enough": ENOUGH, **self.task()}
@@ -508,7 +527,7 @@ class PlanFromMesh(_PlanTool):
     no_table: bool = option(False, VIEW_HELP["no_table"])
 
     def run(self, place: Workplace) -> PlanAnswer:
-        """Render a view of the mesh, plan on it, and return the answer."""
+        """Render a view of the mesh, plan on it, and return the answer. All files are in the folder `place`."""
         path = place.mesh("mesh", self.mesh)
         out = place.out(self.out, path)
         solid = read_mesh(path)
@@ -537,7 +556,7 @@ class ExplainEmpty(_HandTool, _SeenTool):
     )
 
     def run(self, place: Workplace) -> ExplainAnswer:
-        """Explain the loss of all grasps, and return the answer."""
+        """Explain the loss of all grasps, and return the answer. All files are in the folder `place`."""
         path = place.cloud("cloud", self.cloud)
         if is_scene(path):
             scene = read_scene(path)
@@ -590,7 +609,7 @@ class CheckCloud(_SeenTool):
     """
 
     def run(self, place: Workplace) -> CloudAnswer:
-        """Measure the cloud, and return the answer."""
+        """Measure the cloud, and return the answer. All files are in the folder `place`."""
         path = place.cloud("cloud", self.cloud)
         given: Any = {"file": path, "view": self.options(place)}
         notes, report, refusals = CloudCheck(**given).judge()
@@ -623,7 +642,7 @@ class CheckHand(Tool):
     fingers: str = option("default", PLAN_HELP["fingers"])
 
     def run(self, place: Workplace) -> HandAnswer:
-        """Check the hand, and return the answer."""
+        """Check the hand, and return the answer. All files are in the folder `place`."""
         name = place.hand("hand", self.hand)
         chosen = "default" if self.fingers == "auto" else self.fingers
         faults = list_faults(name, chosen)
@@ -692,7 +711,7 @@ class CloseInSimulation(_GraspTool):
     seed: Seed = option(0, "random seed of the noise of the touch sensors")
 
     def run(self, place: Workplace) -> CloseAnswer:
-        """Run the trial, and return the answer."""
+        """Simulate the closing, and return the answer. All files are in the folder `place`."""
         grasp, hand, felt = self.read(place)
         file = place.mesh("mesh", self.mesh)
         import_simulator(self.simulator)
@@ -749,7 +768,7 @@ class ShowGrasp(_GraspTool):
     )
 
     def run(self, place: Workplace) -> PictureAnswer:
-        """Draw the grasp, and return the answer."""
+        """Draw the grasp, and return the answer. All files are in the folder `place`."""
         grasp, hand, estimated = self.read(place)
         file = estimated if self.mesh is None else place.mesh("mesh", self.mesh)
         if not file.is_file():
@@ -775,7 +794,7 @@ class TellHealth(Tool):
     """Tell the version, the folder, the shipped hands and objects, and the installed simulators."""
 
     def run(self, place: Workplace) -> HealthAnswer:
-        """Return the answer at once; no simulator is imported."""
+        """Return the answer at once; no simulator is imported. `place` is the folder of all files."""
         return HealthAnswer(
             version=__version__,
             folder=str(place.root),

@@ -10,7 +10,7 @@ from torchgrasp.foundation.rules import Range
 
 @dataclasses.dataclass(frozen=True)
 class ServerBounds:
-    """Bounds of the server."""
+    """Limits of the server of `torchgrasp mcp`: times, sizes of requests, ports."""
 
     seconds: float = 300.0  # longest time of a call [s]: most take less than a minute
     longest: float = 3600.0  # longest time that a user may allow [s]

@@ -72,8 +72,10 @@ class CloudCheck(ForPrograms):
         return int(refused)
 
     def judge(self) -> tuple[tuple[str, ...], clouds.CloudReport, tuple[clouds.Advice, ...]]:
-        """Return notes on the reading of the cloud, and a report. Return also the refusal of a
-        cloud that no single camera sees.
+        """Return notes on how the file was read, a report on the cloud's quality, and refusals.
+
+        The refusals are one `Advice` for a cloud that no single camera could have seen; else they
+        are (). Raises `BadArgument` for a file that cannot be read.
         """
         file = self.view.read("FILE", find_view(self.file, "FILE"), whole=True)
         file = inputs.without_exact_table(file, self.view.vertical)
@@ -126,7 +128,7 @@ class CloudCut(Command):
     gap: float = option(0.02, "least distance between two objects [m]")
 
     def run(self) -> int:
-        """Cut the object out of the cloud and write its points; return the exit code."""
+        """Cut the object out of the cloud and write its points; return the exit code 0."""
         if not GAPS[0] <= self.gap <= GAPS[1]:
             raise BadArgument("--gap", self.gap, "a number of metres in [0.001, 1]")
         file = self.view.read("CLOUD", self.cloud, whole=True)
@@ -164,7 +166,7 @@ class CloudThin(Command):
     view: inputs.ViewOptions = nested(inputs.ViewOptions())
 
     def run(self) -> int:
-        """Thin the cloud, remove outliers and write the rest; return the exit code."""
+        """Thin the cloud, remove outliers and write the rest; return the exit code 0."""
         file = self.view.read("CLOUD", self.cloud, whole=True)
         some = clouds.voxel_downsample(file.cloud, self.voxel)
         less = clouds.remove_outliers(some)
@@ -193,7 +195,7 @@ class CloudRender(Command):
     seed: Seed = option(0, inputs.SEED_HELP)
 
     def run(self) -> int:
-        """Render the mesh by a simulated depth camera and write the cloud; return the exit code."""
+        """Render the mesh by a simulated depth camera, write the cloud; return the exit code 0."""
         with naming(points="MESH"):
             solid = read_mesh(self.mesh)
             pose = clouds.look_at(self.azimuth, self.elevation, self.distance, solid)
@@ -218,7 +220,7 @@ class CloudViews(Command):
     seed: Seed = option(0, inputs.SEED_HELP)
 
     def run(self) -> int:
-        """Render views of all meshes and write the folder of objects; return the exit code."""
+        """Render views of all meshes and write the folder of objects; return the exit code 0."""
         names = write_objects(self.meshes, self.out, self.views, self.seed)
         print(
             f"{len(names)} objects with {self.views} view{'s' * (self.views != 1)} each: {self.out}"
@@ -242,7 +244,7 @@ class ShapeSurface(Command):
     seed: Seed = option(0, inputs.SEED_HELP)
 
     def run(self) -> int:
-        """Fit the shape and write its surface as a mesh; return the exit code."""
+        """Fit the shape and write its surface as a mesh; return the exit code 0."""
         check_surface_path(self.out)
         file = self.view.read("CLOUD", find_view(self.cloud, "CLOUD"))
         table = self.view.with_table_of(file).plane(file.cloud)

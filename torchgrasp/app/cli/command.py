@@ -78,7 +78,8 @@ def nested(default: Any) -> Any:
 def arguments(**names: str) -> Callable[[type[T]], type[T]]:
     """Return a decorator that makes a class a frozen dataclass of command-line arguments.
 
-    `names` maps arguments of the library to fields of the class, as `Command.names`.
+    `names` gives the field of the class for an argument of the library, as `points="cloud"`. An
+    error that names the argument is then shown with this field's option.
     """
 
     def make(cls: type[T]) -> type[T]:
@@ -247,8 +248,9 @@ class StageProgress:
 def make_bar(total: int | None, unit: str, **options: Any) -> "_Beating":
     """Return a tqdm progress bar; where stderr is no terminal, it prints lines instead.
 
-    `total` is the number of steps, None if it is unknown; `unit` is the name of a step. The lines
-    say how many steps are done, every `BEAT` seconds. With --quiet there are none.
+    `total` is the number of steps, None if it is unknown; `unit` is the name of a step. `options`
+    are further arguments of tqdm. The lines say every 15 s (`BEAT`) how many steps are done. With
+    --quiet there are none.
     """
     return _Beating(total=total, unit=unit, disable=None, leave=False, **options)
 

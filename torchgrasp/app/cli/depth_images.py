@@ -67,7 +67,7 @@ class _DepthCommand(Command):
 
     @property
     def vertical(self) -> Tensor | None:
-        """The vertical as a unit vector, or None if it is not given."""
+        """The unit vector (3,) that points up, in the frame of the results; None without --up."""
         given: Any = {"up": self.up}
         return ViewOptions(**given).vertical
 
@@ -110,7 +110,7 @@ class CloudDepth(_DepthCommand):
     """Write the point cloud of a depth image, with the camera as viewpoint."""
 
     def run(self) -> int:
-        """Convert the depth image and write the cloud; return the exit code."""
+        """Convert the depth image and write the cloud; return the exit code 0."""
         depth, camera, mask, pose = self.images()
         inside = None if mask is None else read_mask(mask, tuple(mask.shape))
         cloud = cloud_from_depth(depth, camera, inside, pose, self.depth_unit, self.vertical)
@@ -153,7 +153,10 @@ class CloudScene(_DepthCommand):
     )
 
     def run(self) -> int:
-        """Find the table and the objects, write the scene and its picture; return the exit code."""
+        """Find the table and the objects, write the scene and its picture; return the exit code 0.
+
+        Raises `BadArgument` if the picture, OUT with the ending .png, would replace an input.
+        """
         picture = self.out.with_suffix(".png")
         if picture.resolve() in [
             path.resolve() for path in (self.depth, self.mask, *self.frames) if path

@@ -14,12 +14,14 @@ MOST_ERROR = 300  # of the message of a failed download [characters]
 def locate_urdf(
     name: Path, meshes: Path | None, out: Path | None
 ) -> tuple[Path, Path | None, Path | None]:
-    """Return the URDF or MJCF, the folder of its meshes, and the folder to write.
+    """Return the path of a hand's URDF or MJCF, the folder of its meshes, and the folder to write.
 
-    If `name` is a name of robot_descriptions, its files are used. Then a folder of this name is
-    written, unless `meshes` or `out` is given. Otherwise the three arguments are returned as they
-    are. Raises `BadArgument` for a name without either, or if the download fails; `MissingExtra`
-    without the package.
+    `name` is such a file, or a name in the package robot_descriptions, such as allegro_hand. For a
+    file, the three arguments are returned unchanged. For a name, its description is downloaded.
+    Then `meshes` of None becomes the downloaded folder, and `out` of None becomes `name`.
+
+    Raises `BadArgument` for a name that the package lacks, and for a description without URDF and
+    MJCF. It is also raised for a failed download. Raises `MissingExtra` if the package is not installed.
     """
     if name.exists() or name.suffix or not str(name).isidentifier():
         return name, meshes, out

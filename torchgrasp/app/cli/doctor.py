@@ -100,9 +100,9 @@ def find_parts() -> list[Finding]:
 
 
 def find_extras() -> list[Finding]:
-    """Return the state of every extra but those of the simulators, as the package lists them.
+    """Return the state of every extra, a group of optional packages, but those of the simulators.
 
-    What is not installed is no fault: only single commands need it.
+    A missing one gets no `fix`, as only single commands need it; `found` says how to install it.
     """
     try:
         lines = importlib.metadata.requires("torchgrasp") or []

@@ -177,7 +177,7 @@ class Evaluate(_Trials, ForPrograms):
         return dataclasses.replace(test, noise=noise, push=push, relook=relook, displaced=when)
 
     def run(self) -> int:
-        """Evaluate the objects, write the results and print the summary; return the exit code."""
+        """Evaluate the objects, write the results and print the summary; return the exit code 0."""
         import_simulator(self.simulator)
         hand, among = load_fingers(self.hand, self.fingers)
         test = self._test()

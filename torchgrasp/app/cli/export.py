@@ -122,7 +122,7 @@ class Export(Command):
     )
 
     def run(self) -> int:
-        """Load the grasps and write them in the chosen format; return the exit code."""
+        """Load the grasps and write them in the chosen format; return 0, or 1 for no grasp."""
         surface = self.grasps.with_name(SURFACE)
         replaced = (self._plays or self.format == "glb") and surface.is_file()
         if self._needs_object and self.object is None and not replaced:

@@ -169,7 +169,10 @@ class Grasp(ForPrograms):
     )
 
     def run(self) -> int:
-        """Plan grasps, close the hand if asked, and write the results; return the exit code."""
+        """Plan grasps, close the hand if asked, and write the results; return the exit code.
+
+        It is 0 if a grasp passed all checks or, with --close, if the object was held; else 1.
+        """
         path = self._find_input()
         out = Path("out") / inputs.object_name(path) if self.out is None else self.out
         inputs.check_folder(out)
@@ -591,9 +594,11 @@ class Grasp(ForPrograms):
 def check_truth(
     cloud: PointCloud, mesh: "trimesh.Trimesh", table: Plane | None, given: bool
 ) -> Plane | None:
-    """Return the table under the true mesh [m], which is the `table` if that is `given`.
+    """Return the table on which the true mesh [m] stands; None without a `table`.
 
-    Raises `BadArgument` for a mesh that contradicts the cloud, or does not stand on a given table.
+    All are in the frame of the cloud. A table that the user has `given` is returned unchanged.
+    Another is a guess, and is moved along its normal to the mesh's lowest point. Raises
+    `BadArgument` for a mesh that contradicts the cloud, or does not stand on a given table.
     """
     check_mesh(cloud, mesh, "--mesh")
     if not given:
@@ -604,7 +609,11 @@ def check_truth(
 
 
 def describe_seen(cloud: PointCloud, table: Plane | float | None, given: bool) -> str:
-    """Return a text on a cloud and its table, which is at the lowest point if it is not `given`."""
+    """Return a text on a cloud: number of points, whether the camera is known, where the table is.
+
+    `table` is a plane, a height z [m], or None for no table. Unless the user has `given` it, the
+    text says that it is at the lowest point of the cloud.
+    """
     camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
     place = "no table"
     if table is not None:
@@ -613,7 +622,10 @@ def describe_seen(cloud: PointCloud, table: Plane | float | None, given: bool) -
 
 
 def print_grasps(run: Run) -> bool:
-    """Print the best grasps and the verdict; return whether any grasp is executable."""
+    """Print the best executable grasps, which passed all checks, and the result in a sentence.
+
+    Return whether any grasp is executable.
+    """
     if len(run.executable):
         print(
             f"\n{format_columns([grasp_columns(run.grasps), *grasp_rows(run.executable, SHOWN)])}\n"
@@ -627,26 +639,35 @@ def print_grasps(run: Run) -> bool:
 
 
 def name_in_order(labels: Sequence[int]) -> str:
-    """Return the names of objects of a scene in the order in which they are taken away."""
+    """Return a text that names objects of a scene by their labels, as "object 3, then object 1".
+
+    The labels are in the order in which the objects are taken away.
+    """
     return ", then ".join(f"object {label}" for label in labels)
 
 
 def rank_best(grasps: Grasps) -> float:
-    """Return the predicted success of the best executable grasp: 0 if it is unknown, -1 if there
-    is none.
+    """Return the predicted success, in [0, 1], of the best grasp that passed all checks.
+
+    It is 0 if the success is unknown, and -1 without such a grasp.
     """
     best = grasps[grasps.status == Status.OK][:1]
     return max(0.0, *best.success.nan_to_num().tolist()) if len(best) else -1.0
 
 
 def describe_best(grasps: Grasps) -> str:
-    """Return a text that says how likely the best executable grasp is to hold."""
+    """Return a text with the predicted success of the best grasp that passed all checks, or "no
+    grasp".
+    """
     best = grasps[grasps.status == Status.OK][:1]
     return f"success {format_success(best)}" if len(best) else "no grasp"
 
 
 def describe_drag(drag: DragPlan, hand: Hand) -> str:
-    """Return a sentence that says what the hand does in a drag."""
+    """Return a sentence on a drag of the object over the table to its edge.
+
+    It names the fingers that press, their force [N], and the length [mm] and direction of the drag.
+    """
     pressing = [
         name
         for name, pressed in zip(hand.tips.names, drag.presses.tolist(), strict=True)

@@ -64,7 +64,7 @@ from torchgrasp.testing import check_hand, find_faults, most_met
 
 @dataclasses.dataclass(frozen=True)
 class HandTrial:
-    """Parameters of the trial of a new hand, and least shares of its random postures."""
+    """Parameters of `hand check`: planning on shipped objects, and statistics of random postures."""
 
     objects: tuple[str, ...] = ("cylinder", "jug")  # names of the objects that are tried in turn
     starts: int = 100  # initial guesses for each object
@@ -208,7 +208,10 @@ class HandCheck(ForPrograms):
     )
 
     def run(self) -> int:
-        """Check, describe and draw the hand, and plan on a shipped object; return the exit code."""
+        """Check, describe and draw the hand, and plan on a shipped object; return the exit code.
+
+        It is 2 for a hand with faults, 1 if no grasp passed all checks, else 0.
+        """
         if self.out.suffix.lower() != ".png":
             raise BadArgument("--out", self.out, "a file ending in .png")
         chosen = "default" if self.fingers == "auto" else self.fingers
@@ -299,7 +302,11 @@ def list_faults(hand: str | Path, fingers: str = "default") -> tuple[str, ...]:
 
 
 def list_unusual(hand: Hand) -> list[str]:
-    """Return a sentence for each kind of number of a hand's URDF that no hand has."""
+    """Return a warning for each kind of number in a hand's URDF that is outside the usual range.
+
+    The kinds are sizes, distances, masses, and the joints' ranges, efforts and velocities. One more
+    warning names joints with soft limits, which the library ignores.
+    """
     urdf = read_urdf(hand.urdf_path)
     return find_unusual(urdf, shape_points(urdf, urdf.path.parent))
 
@@ -335,7 +342,9 @@ def describe_abilities(abilities: HandAbilities) -> str:
 def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
     """Return warnings about a hand without faults, each with its fix.
 
-    `joints` (n, h) are n random postures of the h actuated joints [rad].
+    They tell if few postures are free of self-collision, or if few can hold an object. They name
+    the pads that seldom face the other fingers. `joints` (n, h) are n random postures of the h actuated
+    joints [rad].
     """
     warnings = []
     free = hand.self_clearance(joints) > 0
@@ -420,7 +429,7 @@ class HandSample(Command):
     seed: Seed = option(0, SEED_HELP)
 
     def run(self) -> int:
-        """Draw random postures and write them; return the exit code."""
+        """Draw random postures and write them; return the exit code 0."""
         hand, _ = load_fingers(self.hand, self.fingers)
         begin = time.perf_counter()
         with make_bar(self.n, "posture", unit_scale=True) as bar:
@@ -464,7 +473,7 @@ class HandTrain(Command):
     )
 
     def run(self) -> int:
-        """Sample postures, fit and evaluate the model, and write it; return the exit code."""
+        """Sample postures, fit and evaluate the model, and write it; return the exit code 0."""
         if self.out is not None and self.out.suffix != ".safetensors":
             raise BadArgument("--out", self.out, "a file ending in .safetensors")
         hand = check_hand(self.hand)

@@ -82,7 +82,10 @@ class Import(Command):
     )
 
     def run(self) -> int:
-        """Read the grasps of another program, certify and write them; return the exit code."""
+        """Read the grasps of another program, certify and write them; return the exit code.
+
+        It is 0 if any grasp has force closure, else 1.
+        """
         hand, _ = load_fingers(self.hand, self.fingers)
         if self.touch is not None and self.cloud is None and self.mesh is None:
             raise BadArgument("--touch", self.touch, "a surface: --mesh or --cloud")

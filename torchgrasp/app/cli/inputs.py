@@ -89,11 +89,13 @@ class ViewOptions:
         return unit(vector)
 
     def read(self, name: str, path: Path, whole: bool = False) -> CloudFile:
-        """Return the cloud in the file at `path`, read as the options say.
+        """Return the cloud [m] in the file at `path`, read as the options say.
 
-        Errors call the file by `name`, its argument. With `whole`, scenes of any size are accepted,
-        and all points are kept. Raises `BadArgument` for options that exclude each other, and for
-        an unusable cloud.
+        It is in the frame of the file; with --camera-pose, in that to which the pose leads. By
+        default it is checked, and at most 100,000 random points (`MOST_POINTS`) are kept. With
+        `whole`, clouds of any size and extent are accepted, and all points are kept. Errors call
+        the file `name`. Raises `BadArgument` for options that exclude each other, and for an
+        unusable cloud.
         """
         if self.viewpoint is not None and (self.no_viewpoint or self.camera_pose is not None):
             raise BadArgument(
@@ -145,8 +147,9 @@ class CloudOptions(ViewOptions):
     no_table: bool = option(False, "there is no table")
 
     def with_table_of(self, file: CloudFile) -> "CloudOptions":
-        """Return the options with the table of a file, if neither --table nor --no-table is
-        given.
+        """Return the options with the table of a file as --table.
+
+        They are returned unchanged if --table or --no-table is given, or if the file has no table.
         """
         if file.table is None or self.table is not None or self.no_table:
             return self
@@ -155,7 +158,10 @@ class CloudOptions(ViewOptions):
 
     @property
     def given_table(self) -> Plane | float | None:
-        """The table of --table, as a plane or as a height z [m]; None if it is not given."""
+        """The table of --table in the frame of the cloud; None if it is not given.
+
+        It is a plane, or a height z [m].
+        """
         if self.table is None:
             return None
         given = read_table(self.table)
@@ -166,7 +172,7 @@ class CloudOptions(ViewOptions):
         return height if self.vertical is None else Plane(self.vertical, height)
 
     def plane(self, cloud: PointCloud) -> Plane | float | None:
-        """Return the table as a plane or as a height z [m]; None means no table.
+        """Return the table in the frame of the cloud: a plane, a height z [m], or None for none.
 
         By default the table is at the lowest point of the cloud that is no outlier. Raises
         `BadArgument` for --table and --no-table together.
@@ -185,10 +191,10 @@ class CloudOptions(ViewOptions):
         return self._at(float((seen[:, 2] if up is None else seen.double() @ up).min()))
 
     def given_vertical(self, plane: Plane | None) -> Tensor | None:
-        """Return the unit vector (3,) of --up, else the normal of --table. Return None without
-        both.
+        """Return the unit vector (3,) of --up, else the normal of --table; None without both.
 
-        Both point up. `plane` is the table in the frame of the cloud.
+        The vector points up, in the frame of the cloud. `plane` is the table in this frame; None
+        means no table.
         """
         if self.up is not None or self.table is None or plane is None:
             return self.vertical
@@ -197,8 +203,8 @@ class CloudOptions(ViewOptions):
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
         """Return advice on the quality of a cloud.
 
-        `table` is a plane, a height z [m], or None for no table. Raises `BadArgument` if no grasp
-        should be planned on the cloud.
+        `table` is a plane, a height z [m], or None for no table, in the frame of the cloud. Raises
+        `BadArgument` for a fault with which no grasp should be planned, such as a wrong unit.
         """
         plane = as_plane(table)
         up = self.given_vertical(plane)
@@ -211,7 +217,8 @@ class CloudOptions(ViewOptions):
 
 
 def read_table(table: tuple[float, ...]) -> Plane | float:
-    """Return the table as a plane, given four numbers, or as a height [m], given one.
+    """Return the table as a plane, given four numbers, or as a height [m] along the vertical, given
+    one.
 
     Four numbers are a vector n along the normal, of any length, and d. Points p [m] of the table
     have n . p = d. Raises `BadArgument` for another count of numbers, or a normal of length zero.
@@ -232,9 +239,10 @@ def read_table(table: tuple[float, ...]) -> Plane | float:
 def with_edge(table: Plane | float | None, edge: tuple[float, ...]) -> Plane:
     """Return a table, a plane or a height z [m], that ends at the edge of --edge.
 
-    `edge` holds a point on the edge [m] and the direction away from the table. Each has x and y, or
-    x, y and z. Raises `BadArgument` without a table, for another count of numbers, or for a
-    direction of length zero. With x and y alone, it is also raised if z is not up.
+    All are in the frame of the cloud. `edge` holds a point on the edge [m] and the direction away
+    from the table. Each has x and y, or x, y and z. Raises `BadArgument` without a table, for
+    another count of numbers, or for a direction of length zero. With x and y alone, it is also
+    raised if z is not up.
     """
     plane = as_plane(table)
     if plane is None:
@@ -277,10 +285,11 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
 
 
 def read_region(name: str, text: str | None) -> Region | None:
-    """Return the region that the text of the option `name` describes; None for None.
+    """Return the region of space that the text of the option `name` describes; None for None.
 
-    The text holds six numbers, two corners of a box [m], or the path of a closed mesh [m]. Raises
-    `BadArgument` for another count of numbers.
+    The text holds six numbers, two corners of a box, or the path of a closed mesh. Both are in
+    metres, in the frame of the cloud. A note is printed for a box whose sides are all above
+    2 m. Raises `BadArgument` for another count of numbers, or an unusable mesh.
     """
     with naming(mesh=name, low=name, high=name):
         try:
@@ -301,16 +310,21 @@ def read_region(name: str, text: str | None) -> Region | None:
 
 
 def read_distribution(name: str, text: str) -> float | Distribution:
-    """Return the number or the distribution that the text of the option `name` holds."""
+    """Return the number or the distribution that the text of the option `name` holds.
+
+    Examples are "0.5", the interval "0.3:0.8", and "0.2|0.8" for one of both. Raises `BadArgument`,
+    which names the option, for another text.
+    """
     with naming(text=name, parts=name, weights=name):
         return Distribution.read(text)
 
 
 def without_exact_table(file: CloudFile, up: Tensor | None) -> CloudFile:
-    """Return a simulator's cloud without the points of its table, which is then known.
+    """Return a cloud without the points of its table, if they lie exactly in a plane.
 
-    `up` (3,) is the unit vector that points up; None means z. Other clouds are returned as they
-    are.
+    Only a simulator gives such points. Their plane becomes the `table` of the result, and a note
+    says so. Any other cloud, and one whose table is known, is returned unchanged. `up` (3,) is the
+    unit vector that points up, in the frame of the cloud; None means z.
     """
     if file.table is not None:
         return file
@@ -323,7 +337,7 @@ def without_exact_table(file: CloudFile, up: Tensor | None) -> CloudFile:
 
 
 def print_notes(notes: tuple[str, ...], advice: tuple[Advice, ...] = ()) -> None:
-    """Print notes on how a file was read, and advice on the cloud."""
+    """Print notes on how a file was read, and advice on the cloud, a line for each."""
     for note in notes:
         print(f"{'note':8}{note}")
     for one in advice:
@@ -359,8 +373,9 @@ def holding(
 ) -> Iterator[None]:
     """Within the context, lock the folder or file at `path` against other runs.
 
-    Errors call it by `name`, its option. `hold(path)` is the context in which it is locked, by
-    default that of a folder. A `path` of None locks nothing.
+    `hold(path)` returns the context in which it is locked, by default that of a folder. A `path` of
+    None locks nothing. Raises `OutputError`, which names the option `name`, if another run has the
+    lock or nothing can be written.
     """
     with contextlib.ExitStack() as held:
         if path is not None:
@@ -370,9 +385,11 @@ def holding(
 
 
 def load_fingers(hand: str, fingers: str) -> tuple[Hand, Literal["auto"] | None]:
-    """Return the hand of --hand with --fingers, and "auto" if all its sets of fingers are tried.
+    """Return the hand with its chosen fingers, then "auto" if the planner is to try all its sets.
 
-    The second result is None for one set of fingers.
+    Otherwise the second result is None. `hand` is a name or a folder. `fingers` is a set of fingers
+    of the hand, their number, their names with commas between, or "auto". For "auto" the hand has
+    its default fingers. Raises `BadArgument`, which names --hand or --fingers, for an unknown one.
     """
     with naming(hand="--hand", name="--hand", name_or_path="--hand", fingers="--fingers"):
         return (load_hand(hand), "auto") if fingers == "auto" else (load_hand(hand, fingers), None)

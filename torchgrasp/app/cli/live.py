@@ -18,9 +18,12 @@ def shoot_scene(out: Path, serial: str | None, view: CloudOptions) -> Path:
     """Take the depth image of a RealSense, write the scene and its picture into a folder; return
     the scene's path.
 
-    `serial` is the number of the camera, None means the only one. The `view` gives the table, the
-    vertical and the camera's pose. Raises `BadArgument` for what `shoot_depth` and
-    `Scene.from_depth` refuse.
+    `serial` is the serial number of the camera; None means the only one that is connected. `view`
+    has the options for the table, the vertical and the camera's pose.
+
+    Raises `BadArgument` without a camera that gives depth images, and for a table or a pose that
+    the image contradicts. Raises `NoSupport` if no plane is found on which objects stand, and
+    `MissingExtra` without pyrealsense2.
     """
     camera = dict.fromkeys(("camera", "depth", "intrinsics", "frames", "points"), "--realsense")
     options = {"camera_pose": "--camera-pose", "up": "--up", "table": "--table"}

@@ -21,7 +21,10 @@ class OpenPage(Command):
     no_browser: bool = option(False, "only print the address")
 
     def run(self) -> int:
-        """Print the address of the 3D page and open it in the browser; return the exit code."""
+        """Print the address of the 3D page and open it in the browser; return the exit code 0.
+
+        Raises `BadArgument` if there is no such page.
+        """
         folder = self.folder if self.folder.exists() else "out" / self.folder
         page = folder
         if folder.suffix != ".html":
@@ -44,7 +47,7 @@ class ListObjects(Command):
     """List the shipped objects, each with a noisy view and a true mesh."""
 
     def run(self) -> int:
-        """Print name, mass and files of each shipped object; return the exit code."""
+        """Print name, mass [kg] and files of each shipped object; return the exit code 0."""
         for name in list_objects():
             folder = DATA / name
             print(

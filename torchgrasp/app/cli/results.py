@@ -45,11 +45,12 @@ def make_run(
     task: GraspTask,
     **more: Any,
 ) -> Run:
-    """Return the run of a plan.
+    """Return the `Run` of a plan, the record of its inputs and results for reports.
 
-    It tells what lowers the success of the best executable grasp most, and from where a second view
-    would help. The first arguments are those of `Run`, and `more` are others by name. `shape` is
-    the estimated shape, and `task` that for which success is predicted.
+    It also says what lowers the predicted success of the best executable grasp most. And it says
+    from where a second view would help. The arguments up to `grasps` are the first fields of `Run`,
+    and `more` are other fields by name. `shape` is the estimated shape of the object. `task` is the
+    task for which success is predicted.
     """
     hand = hand_of(grasps, hand)
     costs = [
@@ -65,9 +66,10 @@ def make_run(
 
 
 def write_run(out: Path, run: Run, pages: bool) -> list[Path]:
-    """Write the grasps of a run into a folder, and the `pages` for a person; return the paths.
+    """Write the grasps of a run into the folder `out`; return the paths of all files.
 
-    The estimated surface is written if a grasp is executable.
+    The estimated surface is written, too, if a grasp passed all checks. With `pages`, an HTML
+    report and a 3D page are written for a person.
     """
     paths = [out / GRASPS]
     run.grasps.save(paths[0])
@@ -82,9 +84,11 @@ def write_run(out: Path, run: Run, pages: bool) -> list[Path]:
 
 
 def find_look(shape: ShapeGP, grasps: Grasps, spec: ContactSpec) -> NextView | None:
-    """Return from where a second view would help.
+    """Return the camera of a second view that would make the estimated shape more certain, or None.
 
-    It is None if the best grasp is likely enough, or if no view would tell much.
+    It is None if the best grasp that passed all checks has a predicted success of 0.9 (`ENOUGH`) or
+    more. It is also None if every view leaves at least 0.8 (`HELPS`) of the surface's mean standard
+    deviation.
     """
     best = grasps[grasps.status == Status.OK][:1]
     if len(best) and float(best.success[0]) >= ENOUGH:
@@ -94,9 +98,10 @@ def find_look(shape: ShapeGP, grasps: Grasps, spec: ContactSpec) -> NextView | N
 
 
 def describe_run(run: Run, out: Path) -> dict[str, Any]:
-    """Return the result of a run for JSON, with units in the names.
+    """Return the result of a run as a dict for JSON, with units in the names of its entries.
 
-    `best` is the best executable grasp, or None; `file`, in the folder `out`, holds all grasps.
+    The entry "best" is the best grasp that passed all checks, or None. The entry "file" is the path
+    of the file with all grasps, in the folder `out`.
     """
     best = None
     for grasp in run.executable[:1]:
@@ -123,7 +128,10 @@ def describe_run(run: Run, out: Path) -> dict[str, Any]:
 
 
 def describe_look(view: NextView) -> dict[str, Any]:
-    """Return a camera for a second view for JSON, with units in the names."""
+    """Return the camera of a second view as a dict for JSON, with units in the names of its entries.
+
+    "turn_deg" is None if no earlier camera is known.
+    """
     return {
         "obj_from_camera_m": view.camera_pose.tolist(),
         "turn_deg": view.turn if view.turn == view.turn else None,
@@ -149,7 +157,8 @@ def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] 
 def table_under(mesh: "trimesh.Trimesh", table: Plane | None) -> Plane | None:
     """Return a table moved along its normal to the lowest point of the true mesh [m]; None for None.
 
-    A robot guesses the height of a table that is not given.
+    Both are in one frame. So a table whose height was guessed from the cloud is where the object
+    stands.
     """
     if table is None:
         return None

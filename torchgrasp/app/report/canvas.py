@@ -127,9 +127,10 @@ class Canvas:
     ) -> None:
         """Add a mesh with one colour "#rrggbb", or with a colour in [0, 1] for each vertex.
 
-        `vertices` [m] have the vertex `normals`; without them, edges with a strong bend look sharp.
-        `faces` (t, 3) are indices of three vertices. With `lit` False the mesh gets no shading. A
-        `transparent` mesh shows the opaque ones behind it.
+        `vertices` [m] have the vertex `normals`. Without them, edges where faces bend by more than
+        40 degrees (`SMOOTH_BEND`) look sharp. `faces` (t, 3) are indices of three vertices.
+        With `lit` False the mesh gets no shading. A `transparent` mesh shows the opaque ones behind
+        it.
         """
         corners = vertices[faces]
         bent = sharp_normals(vertices, faces) if normals is None else normals[faces]
@@ -279,8 +280,9 @@ def _cut_off(
 def sharp_normals(
     vertices: Float[np.ndarray, "v 3"], faces: np.ndarray
 ) -> Float[np.ndarray, "f 3 3"]:
-    """Return a unit normal for each corner of each face; only edges with a strong bend look sharp.
+    """Return a unit normal for each of the three corners of each of f faces, for shading.
 
+    Edges where faces bend by more than 40 degrees (`SMOOTH_BEND`) look sharp, others smooth.
     `faces` (f, 3) are indices of three vertices; `vertices` are in metres.
     """
     mesh = trimesh.Trimesh(vertices, faces)

@@ -56,8 +56,10 @@ def first_touches(closure: ClosureResult) -> list[int]:
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     """Return the index of the control tick at which the object was lost; None if it was held.
 
-    An object is lost if it was pushed away, put down, let go, or slipped too far. `centre` is its
-    centre of mass [m] in the frame of the grasp, where z is up.
+    It was lost when it was pushed away, or slipped or turned too far in the hand. It was also lost
+    when fewer than two fingers still touched it. An object that was put down as too heavy was lost
+    at the hand's greatest height. `centre` is its centre of mass [m] in the frame of the
+    grasp, where z is up.
     """
     if closure.held:
         return None
@@ -145,8 +147,10 @@ def moments_of(
 ) -> list[Moment]:
     """Return the key moments that the film strip of a closing shows, in the order of time.
 
-    `centre` is the object's centre of mass [m] in the frame of the grasp, where z is up. `fingers`
-    are the names of the fingers.
+    They are the open hand, the first touch, the ends of closing and pressing, the loss, and the
+    last tick. If the hand closed several times, the begin of the last closing is another. Those
+    that did not happen are left out. `centre` is the object's centre of mass [m] in the frame of
+    the grasp, where z is up. `fingers` are the names of the fingers.
     """
     found = [Moment(tick_of(closure, 0), "open hand")]
     if closure.contact_order:

@@ -22,7 +22,9 @@ FAR = 0.25  # an object this far from its first place [m] is lost, and is not fr
 
 
 def finite_ticks(closure: ClosureResult) -> Int[Tensor, " k"]:
-    """Return the control ticks with a known state; those of a diverged simulation are left out."""
+    """Return the indices of the control ticks with a finite state; a diverged simulation has
+    others.
+    """
     poses = closure.object_pose.isfinite() & closure.hand_pose.isfinite()
     return flatnonzero(closure.joints.isfinite().all(-1) & poses.all(-1).all(-1))
 
@@ -43,9 +45,9 @@ def draw_ticks(
         mesh: the object's mesh [m], which `closure.object_pose` moves to a frame where z is up.
         hand: the hand of the closing.
         closure: the record of the closing, in that frame.
-        ticks: the control ticks.
-        framed: indices of the ticks at which the hand must be in view.
-        direction: direction to the camera.
+        ticks: indices of the n control ticks that are drawn, in the record.
+        framed: indices from 0 to n - 1 of the drawn ticks at which the hand must be in view.
+        direction: direction from the object to the camera, of any length.
         table: the level table, whose height becomes that of the object's lowest point at first;
             None means no table.
         size: width and height of a picture [pixels].

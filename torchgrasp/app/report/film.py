@@ -96,7 +96,8 @@ def draw_film(
 
     `closure` holds the record that is plotted. `mesh` is the true object [m] in the frame of the
     grasp, where z is up. The unit vector `direction` points from the object to the camera.
-    The table ends at an `edge`; None means that it does not end.
+    The level table is below the object. It ends at the vertical plane `edge`, whose normal points
+    away from it; None means no end.
     """
     from matplotlib.figure import Figure
 

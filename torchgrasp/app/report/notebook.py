@@ -65,7 +65,19 @@ class GraspSheet:
 def make_sheet(
     grasps: Grasps, cloud: CloudLike | None = None, hand: HandLike | None = None
 ) -> GraspSheet:
-    """Return the table and the picture that `Grasps.show` returns, which has the same arguments.
+    """Return a table of up to five executable grasps, and a picture of the first, for notebooks.
+
+    Executable grasps passed all checks. `Grasps.show` calls it.
+
+    Args:
+        grasps: the grasps of a plan, best first.
+        cloud: the cloud that was planned on. The picture then has the surface estimated from it;
+            None leaves the surface out.
+        hand: the hand of the grasps, its name or its folder; None means the hand that the grasps
+            name.
+
+    Raises `BadArgument` for a cloud that the grasps do not touch, or for another hand. Without
+    `hand` it is also raised if the grasps name no hand.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> print(make_sheet(load_shipped_grasp("jug", "barrett")).title)

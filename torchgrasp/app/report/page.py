@@ -141,7 +141,7 @@ def encode_base64(data: bytes) -> str:
 
 
 def render(template: str, **values: Any) -> str:
-    """Return a page made from the file `template` of the folder `TEMPLATES` and values by name.
+    """Return a page made from the template file `template` of this package and values by name.
 
     Values of type `markupsafe.Markup` are inserted as HTML; others are escaped.
     """

@@ -154,8 +154,8 @@ def verdict(run: Run) -> str:
 def closing_sentence(run: Run) -> str:
     """Return one sentence with the result of the closing on the true object.
 
-    If the object was held, it says how far it rose [m], and how it moved in the hand [mm, deg].
-    Otherwise it says why not.
+    The run must have a closing and a mesh. If the object was held, the sentence has
+    its rise [m], and its motion in the hand [mm, deg]. Otherwise it says why not.
     """
     upright = run.upright()
     closure = upright.closure

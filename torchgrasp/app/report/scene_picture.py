@@ -140,9 +140,10 @@ def encode_scene(scene: Scene) -> bytes:
 
 
 def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-    """Return the index in `KINDS` of each pixel, and the label of its object.
+    """Return the kind of each pixel, and the label of its object, for an image of h x w pixels.
 
-    The index counts only where the label is 0, on no object.
+    The kinds are 0 not measured, 1 not on the support, 2 support, 3 another possible support, and 4
+    obstacle. They count only where the label is 0, on no object.
     """
     image = scene.image
     labels = scene.pixel_labels.cpu().numpy()

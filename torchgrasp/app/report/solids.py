@@ -31,23 +31,24 @@ class Solid(NamedTuple):
         faces: indices of the three vertices of each of t triangles, (t, 3).
         normals: outward unit normals at the vertices.
         link: index of the link in `hand.tree.link_names`.
+        finger: index of the finger in grasp order; -1 (`PARKED`) if the link belongs to no grasping
+            finger, or to several.
     """
 
     vertices: Float[np.ndarray, "v 3"]
     faces: np.ndarray
     normals: Float[np.ndarray, "v 3"]
     link: int
-    # index of its finger; `PARKED` if it belongs to no grasping finger, or to several
     finger: int
 
     @property
     def color(self) -> str:
-        """The colour "#rrggbb" of the finger, or of the palm."""
+        """The colour "#rrggbb" of the finger; that of the palm if there is no finger."""
         return HAND if self.finger == PARKED else FINGERS[self.finger]
 
 
 def solids_of_links(hand: Hand) -> list[Solid]:
-    """Return the hand as meshes, each in the frame of its link.
+    """Return the hand as meshes [m], each in the frame of its link.
 
     A link whose URDF has a <visual> that can be read is drawn as that mesh. Any other link is drawn
     by its collision shapes.
@@ -78,7 +79,7 @@ def _read_solids(hand: Hand) -> list[Solid]:
 
 
 def solids_by_link(hand: Hand) -> dict[str, Solid]:
-    """Return one mesh by link name for each link that is drawn, in the link's frame."""
+    """Return one mesh [m] for each link that is drawn, in the link's frame, by the link's name."""
     found = {}
     solids = solids_of_links(hand)
     for link, name in enumerate(hand.tree.link_names):
@@ -124,7 +125,10 @@ def solids_from_hand(
 
 
 def place_solids(hand: Hand, obj_from_link: Float[np.ndarray, "l 4 4"]) -> list[Solid]:
-    """Return a hand at the poses [m] of its l links as meshes in the object's frame [m]."""
+    """Return a hand as meshes [m] in the object's frame, given the poses of its l links.
+
+    The poses `obj_from_link` [m] are in the order of `hand.tree.link_names`.
+    """
     placed = []
     for solid in solids_of_links(hand):
         pose = obj_from_link[solid.link]
@@ -135,9 +139,9 @@ def place_solids(hand: Hand, obj_from_link: Float[np.ndarray, "l 4 4"]) -> list[
 
 
 def finger_of_links(hand: Hand) -> dict[str, int]:
-    """Return by link name the index of the finger that the link belongs to.
+    """Return by link name the index of the finger, in grasp order, that the link belongs to.
 
-    The index is `PARKED` for a link that belongs to no grasping finger, or to several.
+    The index is -1 (`PARKED`) for a link that belongs to no grasping finger, or to several.
     """
     moves = hand.tree.moves.bool().cpu()
     finger_of = {}

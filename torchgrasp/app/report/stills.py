@@ -220,7 +220,8 @@ def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "
     """Return the posture in which the fingertip pads face each other best.
 
     It is one of the n postures `joints` of the h actuated joints [rad], without self-collision if
-    there is one.
+    there is one. Best is where the worst pad points most to the tips' centroid, and the tips are
+    near it.
     """
     points, normals = hand.fingertips(joints)
     inward = points.mean(1, keepdim=True) - points
