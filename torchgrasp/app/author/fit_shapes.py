@@ -153,8 +153,8 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
     """Return the URDF with a few boxes or a cylinder instead of every mesh, and a sentence on it.
 
     `points`, from `shape_points`, holds by link an array (n, 3) [m] for each of its shapes. They
-    are in the link's frame. The sentence holds the counts; it is the only one in a list, which
-    is empty without meshes.
+    are in the link's frame. The sentence holds the counts; it is the only one in a list, which is
+    empty without meshes.
     """
     links = []
     count = 0
@@ -197,7 +197,8 @@ def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Point
 def read_mesh_file(urdf: Urdf, name: str, folder: Path) -> "trimesh.Trimesh":
     """Return the mesh [m] of a file that a URDF names, read without any file that it refers to.
 
-    The file lies inside `folder`. Raises `HandFileError` for a file that is refused.
+    The file lies inside `folder`. Raises `HandFileError` for a file that is missing, outside, too
+    large, malformed or without faces. Raises `MissingExtra` for a .dae without pycollada.
     """
     path = mesh_file(urdf, name, folder)
     data = read_bounded(path, MESH_BYTES, "a mesh", functools.partial(HandFileError, "urdf"))

@@ -76,9 +76,9 @@ class ModelHand:
         """Choose the bodies of the hand, and the joints between them.
 
         They hang on the bodies fixed to the world that carry the joints with an actuator. If one
-        body carries these joints, it is the root of the hand, unless it moves itself. Otherwise the
-        world is the root, with its bodies that stand still as the palm. `root` names a body of the
-        hand if the model has several hands; "" if not.
+        body carries these joints, it is the root of the hand, unless a joint moves it. Otherwise
+        the world is the root, with its bodies that stand still as the palm. `root` names a body of
+        the hand if the model has several hands; "" if not.
 
         Raises `HandFileError` for several hands without a `root`, for a hand without an actuator,
         and for ball joints. Raises `BadArgument` for an unknown `root`.
@@ -202,7 +202,7 @@ class ModelHand:
     def couple(self) -> Mechanism:
         """Return which joints of the hand lead, which follow others, and which stand still.
 
-        Actuators may drive joints and fixed tendons; equalities may tie them by straight lines.
+        Actuators may drive joints and fixed tendons; linear equalities may tie them to each other.
         Raises `HandFileError` for others that move the hand, such as spatial tendons or a closed
         loop of bodies. Raises it also for equalities that contradict each other.
         """

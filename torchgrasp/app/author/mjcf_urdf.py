@@ -23,9 +23,9 @@ class UrdfWriter:
         name: name of the robot.
         hand: the bodies and joints of the model that are the hand.
         mechanism: which of its joints lead, follow or stand still.
-        drives: limits and effort of each joint, by its index.
+        drives: limits and effort of each joint, by its index in the model.
         folder: the folder to which meshes are written.
-        visual: whether meshes that are only seen are written, too.
+        visual: whether the meshes of geoms without collision are written, too.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class UrdfWriter:
     def write(self, tips: Sequence[str]) -> str:
         """Return the hand as the text of a URDF; write its meshes to the folder.
 
-        Sites whose names are among `tips`, or say that they are at a fingertip, become links.
+        Sites of the hand become links if their names are among `tips` or contain "tip".
         """
         for body in self.hand.bodies:
             self._add_body(body)

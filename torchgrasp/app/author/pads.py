@@ -131,9 +131,9 @@ def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
 def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
     """Return the indices of the f tips in grasp order.
 
-    First come three whose pads face each other in the largest share of postures. Each further one
-    keeps the share largest. `frames` are poses (3 x 4) [m] of the tips in n random postures, in the
-    frame of the URDF's root. `pads` are in the frames of the tips.
+    First come the three whose pads face each other in the largest share of postures. Each further
+    tip is that with which this share stays largest. `frames` are poses (3 x 4) [m] of the tips in n
+    random postures. They are in the frame of the URDF's root. `pads` are in the frames of the tips.
     """
     contacts = torch.tensor([pad.contact for pad in pads], dtype=torch.float64)
     normals = torch.tensor([pad.normal for pad in pads], dtype=torch.float64)

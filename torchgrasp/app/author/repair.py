@@ -60,7 +60,7 @@ def keep_below(urdf: Urdf, root: str) -> Step:
     """Return the URDF with only the link `root` and the links below it, and a sentence on it.
 
     This cuts a hand off an arm. The list of sentences is empty if `root` is the first link already.
-    Raises `BadArgument` for an unknown root, and `HandFileError` for a joint that follows one above
+    Raises `BadArgument` for an unknown root, and `HandFileError` for a joint that mimics one above
     the root.
     """
     names = {x.name for x in urdf.links}
@@ -262,10 +262,10 @@ def _fixed(joint: Joint, value: float) -> Joint:
 def repair_joints(urdf: Urdf) -> Step:
     """Return the URDF with complete limits of all joints, and a sentence for each repair.
 
-    Missing limits of position, effort and velocity are added. A joint that follows a follower then
-    follows an independent joint. Ranges of independent joints are narrowed so that their followers
-    keep their own limits. Raises `HandFileError` for a sliding joint without limits, and for a
-    follower that cannot keep its limits.
+    Missing limits of position, effort and velocity are added. A follower is a joint that mimics
+    another. One that follows a follower then follows an independent joint. Ranges of independent
+    joints are narrowed so that their followers keep their own limits. Raises `HandFileError` for a
+    sliding joint without limits, and for a follower that cannot keep its limits.
     """
     joints = {j.name: j for j in urdf.joints}
     done = (

@@ -40,10 +40,10 @@ Triangles = tuple[Float[np.ndarray, "_ 3"], np.ndarray]  # corners [m], and face
 def link_meshes(path: Path, data: bytes, folder: Path) -> dict[str, Triangles]:
     """Return one mesh for the <visual> elements of each link, by the name of the link.
 
-    A mesh is its corners (v, 3) [m] in the link's frame, and the indices (t, 3) of the corners of
-    its faces. Where it has too many faces, near corners are joined. A link is left out if one of its
-    visuals is missing, malformed or too large. `path` and `data` are the path and the bytes of the
-    URDF; mesh files lie inside `folder`.
+    A mesh is its corners (v, 3) [m] in the link's frame, and its faces (t, 3). Where it has too
+    many faces, near corners are joined. A link is left out if one of its visuals is missing,
+    malformed or too large. `path` and `data` are the path and the bytes of the URDF; mesh files lie
+    inside `folder`.
     """
     found = {}
     size = 0

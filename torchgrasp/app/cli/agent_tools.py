@@ -527,7 +527,9 @@ class PlanFromMesh(_PlanTool):
     no_table: bool = option(False, VIEW_HELP["no_table"])
 
     def run(self, place: Workplace) -> PlanAnswer:
-        """Render a view of the mesh, plan on it, and return the answer. All files are in the folder `place`."""
+        """Render a view of the mesh, plan on it, and return the answer. All files are in the folder
+        `place`.
+        """
         path = place.mesh("mesh", self.mesh)
         out = place.out(self.out, path)
         solid = read_mesh(path)
@@ -556,7 +558,9 @@ class ExplainEmpty(_HandTool, _SeenTool):
     )
 
     def run(self, place: Workplace) -> ExplainAnswer:
-        """Explain the loss of all grasps, and return the answer. All files are in the folder `place`."""
+        """Explain the loss of all grasps, and return the answer. All files are in the folder
+        `place`.
+        """
         path = place.cloud("cloud", self.cloud)
         if is_scene(path):
             scene = read_scene(path)
@@ -794,7 +798,7 @@ class TellHealth(Tool):
     """Tell the version, the folder, the shipped hands and objects, and the installed simulators."""
 
     def run(self, place: Workplace) -> HealthAnswer:
-        """Return the answer at once; no simulator is imported. `place` is the folder of all files."""
+        """Return the answer without importing a simulator. `place` is the folder of all files."""
         return HealthAnswer(
             version=__version__,
             folder=str(place.root),

@@ -42,7 +42,7 @@ class ServeAgents(Command):
     )
 
     def run(self) -> int:
-        """Serve until the client ends the session, or until a signal; return the exit code."""
+        """Serve until the client ends the session, or until a signal; return the exit code 0."""
         # its tools take a while to import, and no other command needs them
         from torchgrasp.app.cli.agent_server import serve
 

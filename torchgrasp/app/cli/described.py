@@ -21,7 +21,8 @@ def locate_urdf(
     Then `meshes` of None becomes the downloaded folder, and `out` of None becomes `name`.
 
     Raises `BadArgument` for a name that the package lacks, and for a description without URDF and
-    MJCF. It is also raised for a failed download. Raises `MissingExtra` if the package is not installed.
+    MJCF. It is also raised for a failed download. Raises `MissingExtra` if the package is not
+    installed.
     """
     if name.exists() or name.suffix or not str(name).isidentifier():
         return name, meshes, out

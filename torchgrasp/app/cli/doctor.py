@@ -102,7 +102,8 @@ def find_parts() -> list[Finding]:
 def find_extras() -> list[Finding]:
     """Return the state of every extra, a group of optional packages, but those of the simulators.
 
-    A missing one gets no `fix`, as only single commands need it; `found` says how to install it.
+    One that is not complete has no `fix`, as only single commands need it. Then `found` says how to
+    install it.
     """
     try:
         lines = importlib.metadata.requires("torchgrasp") or []

@@ -64,7 +64,7 @@ from torchgrasp.testing import check_hand, find_faults, most_met
 
 @dataclasses.dataclass(frozen=True)
 class HandTrial:
-    """Parameters of `hand check`: planning on shipped objects, and statistics of random postures."""
+    """Parameters of `hand check`: planning on shipped objects, and random postures to judge by."""
 
     objects: tuple[str, ...] = ("cylinder", "jug")  # names of the objects that are tried in turn
     starts: int = 100  # initial guesses for each object
@@ -318,7 +318,11 @@ def describe_sets(hand: Hand) -> str:
 
 
 def describe_abilities(abilities: HandAbilities) -> str:
-    """Return a table of the abilities of a hand with one set of fingers."""
+    """Return a text with the abilities of a hand with one set of fingers, as two tables.
+
+    One has the force [N] of each fingertip. The other has, for each two tips, their span [m] and
+    the widths [m] that they can hold.
+    """
     widths = f"{abilities.least_width:.3f} to {abilities.greatest_width:.3f} m"
     # a hand of which no two tips ever face each other
     if not abilities.least_width <= abilities.greatest_width:
@@ -343,8 +347,8 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
     """Return warnings about a hand without faults, each with its fix.
 
     They tell if few postures are free of self-collision, or if few can hold an object. They name
-    the pads that seldom face the other fingers. `joints` (n, h) are n random postures of the h actuated
-    joints [rad].
+    the pads that seldom face the other fingers. `joints` (n, h) are n random postures of the h
+    actuated joints [rad].
     """
     warnings = []
     free = hand.self_clearance(joints) > 0
@@ -531,7 +535,8 @@ def choose_components(hand: Hand, seed: int, workers: int) -> int:
     """Return the number of Gaussians with the least Bayesian information criterion (BIC), on
     separate random postures.
 
-    The BIC curve is printed. `workers` is the number of threads that sample the postures.
+    The BIC curve is printed. The postures are drawn with the random seed `seed` + 1. `workers` is
+    the number of threads that sample them.
     """
     apart = sample_configurations(hand, TRAIN.postures, seed + 1, workers, "grasping")
     with make_bar(TRAIN.most, "fit", desc="components") as bar:

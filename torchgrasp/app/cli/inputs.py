@@ -288,8 +288,8 @@ def read_region(name: str, text: str | None) -> Region | None:
     """Return the region of space that the text of the option `name` describes; None for None.
 
     The text holds six numbers, two corners of a box, or the path of a closed mesh. Both are in
-    metres, in the frame of the cloud. A note is printed for a box whose sides are all above
-    2 m. Raises `BadArgument` for another count of numbers, or an unusable mesh.
+    metres, in the frame of the cloud. A note is printed for a box whose sides are all above 2 m.
+    Raises `BadArgument` for another count of numbers, or an unusable mesh.
     """
     with naming(mesh=name, low=name, high=name):
         try:

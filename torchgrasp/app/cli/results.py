@@ -128,7 +128,8 @@ def describe_run(run: Run, out: Path) -> dict[str, Any]:
 
 
 def describe_look(view: NextView) -> dict[str, Any]:
-    """Return the camera of a second view as a dict for JSON, with units in the names of its entries.
+    """Return the camera of a second view as a dict for JSON, with units in the names of its
+    entries.
 
     "turn_deg" is None if no earlier camera is known.
     """
@@ -155,7 +156,8 @@ def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] 
 
 
 def table_under(mesh: "trimesh.Trimesh", table: Plane | None) -> Plane | None:
-    """Return a table moved along its normal to the lowest point of the true mesh [m]; None for None.
+    """Return a table moved along its normal to the lowest point of the true mesh [m]; None for
+    None.
 
     Both are in one frame. So a table whose height was guessed from the cloud is where the object
     stands.

@@ -128,9 +128,8 @@ class Canvas:
         """Add a mesh with one colour "#rrggbb", or with a colour in [0, 1] for each vertex.
 
         `vertices` [m] have the vertex `normals`. Without them, edges where faces bend by more than
-        40 degrees (`SMOOTH_BEND`) look sharp. `faces` (t, 3) are indices of three vertices.
-        With `lit` False the mesh gets no shading. A `transparent` mesh shows the opaque ones behind
-        it.
+        40 degrees (`SMOOTH_BEND`) look sharp. `faces` (t, 3) are indices of three vertices. With
+        `lit` False the mesh gets no shading. A `transparent` mesh shows the opaque ones behind it.
         """
         corners = vertices[faces]
         bent = sharp_normals(vertices, faces) if normals is None else normals[faces]

@@ -58,8 +58,8 @@ def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
 
     It was lost when it was pushed away, or slipped or turned too far in the hand. It was also lost
     when fewer than two fingers still touched it. An object that was put down as too heavy was lost
-    at the hand's greatest height. `centre` is its centre of mass [m] in the frame of the
-    grasp, where z is up.
+    at the hand's greatest height. `centre` is its centre of mass [m] in the frame of the grasp,
+    where z is up.
     """
     if closure.held:
         return None

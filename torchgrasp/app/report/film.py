@@ -95,9 +95,9 @@ def draw_film(
     against time.
 
     `closure` holds the record that is plotted. `mesh` is the true object [m] in the frame of the
-    grasp, where z is up. The unit vector `direction` points from the object to the camera.
-    The level table is below the object. It ends at the vertical plane `edge`, whose normal points
-    away from it; None means no end.
+    grasp, where z is up. The unit vector `direction` points from the object to the camera. The
+    level table is below the object. It ends at the vertical plane `edge`, whose normal points away
+    from it; None means no end.
     """
     from matplotlib.figure import Figure
 

@@ -138,7 +138,10 @@ class Run:
 
 
 def verdict(run: Run) -> str:
-    """Return the result of a run in one sentence."""
+    """Return the result of a run in words: of the closing if there is one, else of planning.
+
+    The latter is how many grasps passed all checks or, if none did, why, and what would help.
+    """
     hand = run.hand.name
     name = run.object_name
     if run.closure is not None:
@@ -154,8 +157,8 @@ def verdict(run: Run) -> str:
 def closing_sentence(run: Run) -> str:
     """Return one sentence with the result of the closing on the true object.
 
-    The run must have a closing and a mesh. If the object was held, the sentence has
-    its rise [m], and its motion in the hand [mm, deg]. Otherwise it says why not.
+    The run must have a closing and a mesh. If the object was held, the sentence has its rise [m],
+    and its motion in the hand [mm, deg]. Otherwise it says why not.
     """
     upright = run.upright()
     closure = upright.closure
@@ -176,7 +179,8 @@ def closing_sentence(run: Run) -> str:
 def grasp_columns(grasps: Grasps) -> tuple[str, ...]:
     """Return the titles of the columns of `grasp_rows`.
 
-    These are `GRASP_COLUMNS` and, for grasps planned for a task, "task margin".
+    These are "rank", "success" and the others of `GRASP_COLUMNS`. For grasps planned for a task,
+    "task margin" is the last.
     """
     return (*GRASP_COLUMNS, *["task margin"] * (grasps.certificate.task_margin is not None))
 

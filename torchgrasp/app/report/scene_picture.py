@@ -53,11 +53,8 @@ class SceneInk:
     blur: float = 1.5  # standard deviation [pixels] that smooths the depth before its slopes
     nearest: float = 1e-3  # least depth [m]
     least: float = 1e-6  # least weight, slope and range, so that nothing is divided by 0
-    lamp: tuple[float, float, float] = (
-        -0.5,
-        0.0,
-        -0.8,
-    )  # to the lamp, less the way up (right, down, ahead)
+    # added to the unit vector that points up, it is the direction to the lamp (right, down, ahead)
+    lamp: tuple[float, float, float] = (-0.5, 0.0, -0.8)
     ambient: float = 0.45  # brightness without the lamp
     lit: float = 0.65  # brightness that the lamp adds at most
     haze: float = 0.15  # share of the brightness that the farthest pixels lose
