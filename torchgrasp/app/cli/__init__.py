@@ -89,9 +89,8 @@ All commands: torchgrasp --help. To read: README.md and docs/ of the repository.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line in this process; return its exit code.
 
-    The code is 0 for success and 2 for bad input. It is 1 for a bad result: no grasp passed all
-    checks, or the object was not held. An interrupted run gives 130. Errors are printed as one
-    sentence on stderr.
+    The code is 0 for success and 2 for bad input. It is 1 for a bad result, such as no grasp that
+    passed all checks. An interrupted run gives 130. Errors are printed as one sentence on stderr.
 
     PyTorch uses one thread from then on. Raises `SystemExit` after the help of a command, and for
     unknown options.
