@@ -87,8 +87,8 @@ def find_look(shape: ShapeGP, grasps: Grasps, spec: ContactSpec) -> NextView | N
     """Return the camera of a second view that would make the estimated shape more certain, or None.
 
     It is None if the best grasp that passed all checks has a predicted success of 0.9 (`ENOUGH`) or
-    more. It is also None if every view would leave at least 0.8 (`HELPS`) of the surface's mean
-    standard deviation at the contacts.
+    more. It is also None if every view leaves at least 0.8 (`HELPS`) of the mean standard deviation
+    at the contacts.
     """
     best = grasps[grasps.status == Status.OK][:1]
     if len(best) and float(best.success[0]) >= ENOUGH:

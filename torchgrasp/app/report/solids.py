@@ -102,8 +102,8 @@ def link_poses(
 ) -> Float[Tensor, "n l 4 4"]:
     """Return the poses obj_from_link [m] of all l links, in the order of `hand.tree.link_names`.
 
-    `joints` holds n postures of all j joints of the URDF [rad], whose names are `names`, in any
-    order. `obj_from_hand` holds the n poses of the hand in the object's frame [m].
+    `joints` holds n postures of all j joints of the URDF [rad or m]. Their names are `names`, in
+    any order. `obj_from_hand` holds the n poses of the hand in the object's frame [m].
     """
     values = joints[:, [names.index(n) for n in hand.tree.joint_names]].double()
     return obj_from_hand.double()[:, None] @ hand.tree.poses(values)
@@ -117,7 +117,7 @@ def solids_from_hand(
 ) -> list[Solid]:
     """Return a hand at a posture as meshes in the object's frame [m].
 
-    `joints` [rad] are the positions of all joints of the URDF, whose names are `names`, in any
+    `joints` [rad or m] are the positions of all joints of the URDF. Their names are `names`, in any
     order. `obj_from_hand` is the hand's pose [m].
     """
     poses = link_poses(hand, joints[None], names, obj_from_hand[None])[0].cpu().numpy()
