@@ -253,8 +253,9 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None,
     """Return closure margin, residual max |W phi|, witness (6,) and coefficients phi (m,) of one
     contact set, by HiGHS.
 
-    `wrench` (m, 6) holds the m edge wrenches, which are the columns of W. The witness is None if it
-    is unknown.
+    `wrench` (m, 6) holds the m edge wrenches, which are the columns of W. The margin is the least
+    coefficient, or -inf if no coefficients balance the wrenches. The witness is the unit wrench
+    that proves the margin, or None if HiGHS gives none.
     """
     m = len(wrench)  # seven equations in the margin s and psi = phi - s >= 0
     equations = np.zeros((7, m + 1))
@@ -282,7 +283,8 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None,
 
 
 def check_unit(normals: Vectors) -> Vectors:
-    """Return the normals (b, f, 3); raise `BadArgument` if the length of a normal is not 1.
+    """Return the normals (b, f, 3); raise `BadArgument` if the length of a normal is not 1 to
+    1e-3.
 
     Normals with NaN are accepted.
     """
