@@ -144,8 +144,8 @@ def split_forces(
     """Return the normal parts of forces on an object, positive if they push, then the tangential
     parts.
 
-    `normals` are the outward unit normals of the object where the forces act. The leading axes
-    *b and *c are broadcast to *d.
+    `normals` are the outward unit normals of the object where the forces act. The leading axes *b
+    and *c are broadcast to *d.
     """
     push = -dot(forces, normals)
     return push, forces + push[..., None] * normals

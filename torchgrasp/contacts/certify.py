@@ -240,7 +240,8 @@ def bound_margin(wrench: Wrenches, witness: Float[Tensor, "b 6"]) -> Float[Tenso
     proves.
 
     It is -min(g) / sum(g - min(g)), or NaN if all products g are 0. These are the products of the
-    witness and the m edge wrenches of a contact set, `wrench` (b, m, 6). The bound has no unit.
+    witness and the m edge wrenches of a contact set, `wrench` (b, m, 6). The margin is the greatest
+    s for which coefficients >= s, of sum 1, balance these wrenches. The bound has no unit.
     """
     # With g_k = w.w_k and phi >= s, 0 = sum phi g >= s sum g + (1 - m s) min g. Hence s <= -min g /
     # sum(g - min g).
@@ -283,8 +284,7 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None,
 
 
 def check_unit(normals: Vectors) -> Vectors:
-    """Return the normals (b, f, 3); raise `BadArgument` if the length of a normal is not 1 to
-    1e-3.
+    """Return the normals (b, f, 3); raise `BadArgument` if the length of a normal is not 1 to 1e-3.
 
     Normals with NaN are accepted.
     """

@@ -165,8 +165,10 @@ def triple_jet(shape: ShapeLike, points: Vectors) -> SurfaceJet:
 
 
 def variance_at(shape: ShapeLike, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
-    """Return the variance of the signed distance at normalised points, without its derivatives if
-    possible.
+    """Return the variance (q,) of the signed distance at q normalised points, in squared normalised
+    units.
+
+    Its derivatives are not computed if possible.
     """
     variance = getattr(shape, "variance", None)
     return shape.jet(x).variance if variance is None else variance(x)

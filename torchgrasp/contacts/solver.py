@@ -61,8 +61,8 @@ class Stage:
     """A solver stage: at most `steps` steps with given weights of the constraints.
 
     `centre` and `cones` are weights without unit. `centre` is that of the centroid's offset from
-    the normalised origin, and `cones` that of the friction cones. A contact set stops when its
-    step (normalised) is shorter than `settled`. Unless `exact`, the variance of the surface is
+    the normalised origin, and `cones` that of the friction cones. A contact set stops when its step
+    (normalised) is shorter than `settled`. Unless `exact`, the variance of the surface is
     extrapolated linearly.
     """
 

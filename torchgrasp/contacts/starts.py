@@ -43,8 +43,8 @@ def check_starts(shape: ShapeLike, spec: ContactSpec, starts: int | Tensor) -> N
     """Raise `BadArgument` for initial guesses with a wrong number of contacts, or outside the
     shape's domain.
 
-    The domain is the ball in which the shape is known.
-    `starts` is a number of random guesses, or contact points (b, f, 3) [m].
+    The domain is the ball in which the shape is known. `starts` is a number of random guesses, or
+    contact points (b, f, 3) [m].
     """
     if isinstance(starts, Tensor):
         if starts.ndim == 3 and starts.shape[1] != spec.fingertips:
@@ -66,10 +66,10 @@ def check_starts(shape: ShapeLike, spec: ContactSpec, starts: int | Tensor) -> N
 
 
 def given_starts(shape: ShapeLike, starts: Vectors) -> Iterator[Float[Tensor, "_ f 3"]]:
-    """Yield the caller's initial contact points [m] in chunks, moved onto the surface, in
-    normalised units.
+    """Yield the caller's initial contact points in chunks of at most 500 sets, moved onto the
+    surface, in normalised units.
 
-    `starts` have the shape (b, f, 3).
+    `starts` (b, f, 3) [m] are in the frame of the shape's cloud.
     """
     for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
@@ -201,8 +201,8 @@ def qualify(
     points.
 
     `points` (b, f, 3) are normalised; the normals are outward unit vectors. A contact may lie on
-    the surface, where its variance is low, and in the domain. It must also be above the table, and
-    in the region.
+    the surface, where its variance is below `spec.max_variance`. It must also be above the table
+    and in the region of `spec`. The shape is known in a ball, which must contain it.
     """
     problem = ContactProblem.of(shape, spec)
     distance, gradient = (

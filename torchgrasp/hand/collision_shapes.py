@@ -224,9 +224,9 @@ def collision_pairs(
     from `seed`.
 
     The two links come nearer than 2 mm (`MEETING_DISTANCE`) in some posture. They overlap in at
-    most 98 % of the postures (`ALWAYS`). A link and its parent are never a pair. `coupling` gives the
-    coupled joints by name. Raises `BadArgument` for unknown joints, or an `n` outside [1, 10^7].
-    Raises `HandFileError` if too many shapes are near each other.
+    most 98 % of the postures (`ALWAYS`). A link and its parent are never a pair. `coupling` gives
+    the coupled joints by name. Raises `BadArgument` for unknown joints, or an `n` outside [1,
+    10^7]. Raises `HandFileError` if too many shapes are near each other.
     """
     check_whole("n", n, 1, MOST_POSTURES)
     tree = tree_from_urdf(urdf)

@@ -77,7 +77,9 @@ class BoundedBuilder(ET.TreeBuilder):
         self.depth = self.count = 0
 
     def start(self, tag: Any, attrs: Any) -> Any:
-        """Count the start of an element; raise `HandFileError` beyond the bounds of the class."""
+        """Count the start of an element; raise `HandFileError` for too many elements or too deep
+        nesting.
+        """
         self.depth = self.depth + 1
         self.count = self.count + 1
         if self.depth > XML_DEPTH or self.count > XML_ELEMENTS:

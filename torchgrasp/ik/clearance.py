@@ -192,8 +192,10 @@ class CollisionWorld(Value):
 
 
 def is_world_fused(world: CollisionWorld | None, *tensors: Tensor) -> TypeGuard[CollisionWorld]:
-    """Return whether compiled loops can compute in a world: with one object, and a table without
-    edge.
+    """Return whether compiled loops can compute clearances of hands from a `world`.
+
+    They can with one object for all hands, a table without edge, and `tensors` in float64 on the
+    CPU. Without a world (None) they cannot.
     """
     if world is None or not is_fused(*tensors):
         return False

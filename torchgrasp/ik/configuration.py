@@ -65,11 +65,11 @@ class ResidualRows(NamedTuple):
     """k residuals of g configurations, with the factors of their derivatives with respect to q
     motions of the hand.
 
-    The q motions are three translations, three rotations, and those of the moved joints.
-    `residual` is a weighted length [mm], or a weighted error of a cosine. `wrench` holds its
-    derivatives with respect to a translation [m] and a rotation [rad] about the object's origin.
-    The derivative with respect to a motion is `wrench` times the twist of the motion where `moves`
-    is 1. It is 0 where `moves` is 0.
+    The q motions are three translations, three rotations, and those of the moved joints. `residual`
+    is a weighted length [mm], or a weighted error of a cosine. `wrench` holds its derivatives with
+    respect to a translation [m] and a rotation [rad] about the object's origin. The derivative with
+    respect to a motion is `wrench` times the twist of the motion where `moves` is 1. It is 0 where
+    `moves` is 0.
     """
 
     residual: Float[Tensor, "g k"]

@@ -55,8 +55,8 @@ OPENING = OpeningNumbers()
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
     """Return the positions [m] of the fingertip centres when the tips touch.
 
-    They are one tip radius from the contacts, along the outward normals.
-    Finger i touches contact i. Contacts and results are in the object's frame.
+    They are one tip radius from the contacts, along the outward normals. Finger i touches contact
+    i. Contacts and results are in the object's frame.
     """
     return contacts.points + hand.tips.radius.to(contacts.normals)[:, None] * contacts.normals
 

@@ -41,10 +41,9 @@ def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
 
     The best grasp has the greatest predicted success, or the least variance (`Request.order`). A
     grasp's `score` is the log-odds of its success. `cloud` (g,) is the index of each grasp's
-    object. If the object cannot be lifted out of its
-    surroundings, its grasps get the status `BURIED`. Grasps that the arm cannot follow get
-    `UNREACHABLE`, and grasps that resist less than the loads `NOT_RESISTED`. Grasps of less success
-    than a promise needs get `NO_PROMISE`.
+    object. If the object cannot be lifted out of its surroundings, its grasps get the status
+    `BURIED`. Grasps that the arm cannot follow get `UNREACHABLE`, and grasps that resist less than
+    the loads `NOT_RESISTED`. Grasps of less success than a promise needs get `NO_PROMISE`.
     """
     request = objects.request
     if objects.buried:

@@ -262,8 +262,8 @@ def standardised_rows(
     """Return (rows, means, deviations): standardised data, and the original mean and deviation of
     each dimension.
 
-    The rows have mean 0 and variance 1 in each of the d dimensions: the joints [rad or m],
-    then the code. `distributed` says whether `samples` are only the part of this process. Raises
+    The rows have mean 0 and variance 1 in each of the d dimensions: the joints [rad or m], then the
+    code. `distributed` says whether `samples` are only the part of this process. Raises
     `BadArgument` for codes not of three fingertips, or for less than d + 2 samples for each of
     `components`. Raises it also for a dimension that does not vary.
     """
