@@ -196,7 +196,8 @@ def features(tip: TipPoses) -> Float[Tensor, "k 12"]:
     """Return twelve numbers [mm] for each pose (3, 4); their Euclidean distance is a distance of
     two poses.
 
-    For small rotations it is that of the translation [mm] and the angle times `LEVER` [mm].
+    For small rotations it is the length of two numbers: the translation [mm], and the angle [rad]
+    times 100 mm (`LEVER`).
     """
     turn = LEVER / math.sqrt(2) * tip[:, :3].flatten(0, 1)
     return torch.cat([tip[:, 3] / MILLIMETRE, turn]).T

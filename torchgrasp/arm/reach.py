@@ -44,8 +44,8 @@ class ReachNumbers:
     speed: float = 0.1
     """Speed [m/s] of the tip on the way; a way on which a joint would be too fast is refused."""
     between: int = 8
-    """Links are tested for collisions with each other only at every pose of this number along the
-    way.
+    """Interval of the poses along a way at which links are tested for collisions with each other:
+    every eighth.
     """
     postures: int = 256
     """Number of postures that are compared at a time, which bounds the memory."""
@@ -65,6 +65,8 @@ and the ease of the way, as in `Grasps`.
 def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
     """Return a mask of the k hand poses `obj_from_hand` [m] that the arm reaches within its joint
     limits.
+
+    The poses are those of the hand's root link in the object's frame. Collisions are not tested.
     """
     target = arm.tip_poses(obj_from_hand)  # (3, 4, k)
     reached = target.new_zeros(len(obj_from_hand), dtype=torch.bool)
@@ -99,14 +101,17 @@ def with_arm(
 def follow_grasps(
     arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP
 ) -> Way:
-    """Return the arm's way through each grasp; it is zero if there is none.
+    """Return the arm's postures on its way through each of g grasps: the straight approach, the
+    grasp, the lift.
 
-    The results are the w postures of the way [rad or m], and a mask of the grasps that have a way.
-    The third is the ease of the way: the least columns of `measure_ease`. The arm can follow the
-    whole way from some of the postures that reach the grasp. The way goes through the easiest of
-    these. The arm follows without a jump and within its joint limits. Its links collide neither
-    with the `world`, nor with each other or the palm. If the `world` has no table, the hand is
-    lifted along the unit vector `up`.
+    The first result holds the w postures (g, w, n) [rad or m], zero where there is no way. The
+    second is a mask (g,) of the grasps that have a way. The third (g, 2) holds the least room of a
+    joint on the way, and the least manipulability (`measure_ease`).
+
+    On a way the arm stays within its joint limits and does not jump. Its links collide neither with
+    the `world`, nor with each other or the palm. Several postures may reach the grasp. The way goes
+    through the easiest one from which the arm can follow all of it. If the `world` has no table,
+    the hand is lifted along the unit vector `up`.
     """
     poses = way_of(hand, grasps, world, up).to(arm.lower)
     starts = REACH.starts
@@ -171,9 +176,9 @@ def track(
     """Return arm postures along each way, tracked from the grasp both ways, then a mask of the ways
     without jumps.
 
-    `start` are the postures at the grasps, one in each column. `tips` are the poses (3 x 4) [m] of
-    the tip in the base's frame at all w places. On a way without a jump every pose is reached. No
-    joint moves faster than it can at the hand's speed.
+    `start` are the postures [rad or m] at the grasps, one in each column. `tips` are the w poses (3
+    x 4) [m] of the tip on each way. They are in the frame of the arm's root link. On a way without
+    a jump every pose is reached. No joint moves faster than it can at the hand's speed.
     """
     at = COARSE_STEPS + 1
     path = {at: start}
@@ -257,10 +262,11 @@ def solve_tips(
     """Return postures moved within their limits until the tips are in place, then a mask of those
     in place.
 
-    `start` holds a posture in each column, `target` the poses [m] of the tips in the base's frame.
-    A tip is in place if the sum of its squared errors is below `solved` [mm2]. By default `solved`
-    is that of a hundredth of a millimetre. A posture makes at most `steps` steps. The damping is
-    half the squared error (Sugihara, IEEE Transactions on Robotics 27, 2011).
+    `start` holds a posture [rad or m] in each column. `target` holds the wanted poses (3, 4, k) [m]
+    of the tip in the frame of the arm's root link. An error of rotation [rad] counts times 100 mm
+    (`LEVER`). A tip is in place if the sum of its squared errors is below `solved` [mm2]. By
+    default that is an error of a hundredth of a millimetre. A posture makes at most `steps` steps.
+    The damping is half the squared error (Sugihara, IEEE Transactions on Robotics 27, 2011).
     """
     joints = start.clone()
     rows = torch.arange(start.shape[1], device=start.device)

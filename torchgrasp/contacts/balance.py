@@ -50,8 +50,11 @@ from torchgrasp.geometry.linalg import (
 
 @dataclasses.dataclass(frozen=True)
 class BalanceNumbers:
-    """Parameters of the search for balanced forces over directions, of a short search, and of
-    Newton's method.
+    """Parameters of the searches for balanced contact forces.
+
+    One search tries directions in the space of balanced forces of three contacts. A short search
+    changes known weights of pairs of contacts. Newton's method finds the forces of four or five
+    contacts, in friction cones of a falling coefficient tau.
     """
 
     directions: int = 1024
@@ -87,9 +90,9 @@ class BalanceNumbers:
     lengths: int = 5
     """Number of lengths of each step that are tried, each twice the one before."""
     kept: float = 0.3
-    """Share of tau's distance from the needed ratio that each step leaves."""
+    """Share that each step leaves of tau's distance from the friction that the forces need."""
     first: float = 1.1
-    """The first tau, as a multiple of the ratio that the first forces need."""
+    """The first tau, as a multiple of the friction that the first forces need."""
     max_friction: float = 10.0
     """Friction coefficient of the widest cones in which forces are sought."""
     edges: int = 4
@@ -124,9 +127,9 @@ def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"
     """Return for each of p pairs of contacts the opposite unit forces that pull the two contacts
     together.
 
-    `points` holds sets of f contacts. `[..., k, i, :]` is the force on contact i by pair k, 0 at
-    the other contacts. The order of the pairs is that of `contact_pairs`. The forces of all pairs
-    span all balanced forces, except for four or five contacts in one plane.
+    `points` holds sets of f contacts. `[..., k, i, :]` is the force on contact i by pair k, which
+    is 0 unless i belongs to the pair. Pairs of neighbours (i, i + 1) come first, then (i, i + 2).
+    The forces of all pairs span all balanced forces, except for four or five contacts in one plane.
     """
     f = points.shape[-2]
     first, second = contact_pairs(f, points.device)
@@ -141,7 +144,8 @@ def split_forces(
     """Return the normal parts of forces on an object, positive if they push, then the tangential
     parts.
 
-    `normals` are the outward unit normals of the object where the forces act.
+    `normals` are the outward unit normals of the object where the forces act. The leading axes *b
+    and *c are broadcast to *d.
     """
     push = -dot(forces, normals)
     return push, forces + push[..., None] * normals
@@ -236,8 +240,8 @@ def forces_near(points: Vectors, normals: Vectors, weights: Tensions) -> Vectors
 
     `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals. The forces
     are a weighted sum of the `internal_forces` of p pairs. The search changes the `weights` (b, p),
-    which have no unit. Only the ratios of the forces count. They are NaN for a set if no found
-    forces push at all contacts.
+    which have no unit. The scale of the forces is arbitrary. The forces of a set are NaN if the
+    search finds none that push at all of its contacts.
     """
     pairs = internal_forces(points)
     push, slide = split_forces(pairs, normals[:, None])
@@ -322,7 +326,8 @@ def central_forces(
     `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals. `preferred`
     are normal forces, which also fix the scale of the result. `slack` is added to the friction
     coefficient that the forces need. A larger one gives forces nearer to the preferred ones. The
-    forces of a set are NaN where no balanced forces push at every contact within the widest cones.
+    forces of a set are NaN if no balanced forces push at every contact. They are also NaN if those
+    need a friction coefficient above 10 (`BALANCE.max_friction`).
     """
     wrench = grasp_map(points / centre_and_radius(points)[1])
     null = torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:]

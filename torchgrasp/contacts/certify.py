@@ -240,7 +240,8 @@ def bound_margin(wrench: Wrenches, witness: Float[Tensor, "b 6"]) -> Float[Tenso
     proves.
 
     It is -min(g) / sum(g - min(g)), or NaN if all products g are 0. These are the products of the
-    witness and the m edge wrenches of a contact set, `wrench` (b, m, 6). The bound has no unit.
+    witness and the m edge wrenches of a contact set, `wrench` (b, m, 6). The margin is the greatest
+    s for which coefficients >= s, of sum 1, balance these wrenches. The bound has no unit.
     """
     # With g_k = w.w_k and phi >= s, 0 = sum phi g >= s sum g + (1 - m s) min g. Hence s <= -min g /
     # sum(g - min g).
@@ -253,8 +254,9 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None,
     """Return closure margin, residual max |W phi|, witness (6,) and coefficients phi (m,) of one
     contact set, by HiGHS.
 
-    `wrench` (m, 6) holds the m edge wrenches, which are the columns of W. The witness is None if it
-    is unknown.
+    `wrench` (m, 6) holds the m edge wrenches, which are the columns of W. The margin is the least
+    coefficient, or -inf if no coefficients balance the wrenches. The witness is the unit wrench
+    that proves the margin, or None if HiGHS gives none.
     """
     m = len(wrench)  # seven equations in the margin s and psi = phi - s >= 0
     equations = np.zeros((7, m + 1))
@@ -282,7 +284,7 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None,
 
 
 def check_unit(normals: Vectors) -> Vectors:
-    """Return the normals (b, f, 3); raise `BadArgument` if the length of a normal is not 1.
+    """Return the normals (b, f, 3); raise `BadArgument` if the length of a normal is not 1 to 1e-3.
 
     Normals with NaN are accepted.
     """

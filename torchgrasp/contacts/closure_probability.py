@@ -91,9 +91,11 @@ def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[T
 
 
 def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
-    """Return a mask of the contact sets that lie inside the shape's domain.
+    """Return a mask of the contact sets that lie well inside the ball in which the shape's
+    posterior is valid.
 
-    Each contact [m] is at least half a fingertip's width from the edge of the domain.
+    All contacts [m] of such a set are at least 12 mm (`FOOTPRINT`) from the edge of this ball. They
+    are in the frame of the cloud.
     """
     radius = norm(_normalised_points(shape, contacts))
     return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
@@ -108,7 +110,9 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
     """Return the joint Gaussian of signed distance and gradient on the normal line of each contact.
 
     The contacts [m] are in the frame of the cloud, the result is in normalised units of the shape.
-    Raises the errors of `closure_probability`.
+    Raises `BadArgument` for sets of other than 3 to 5 contacts, and normals not of length 1. It is
+    also raised for a contact outside the domain, or within 12 mm (`FOOTPRINT`) of its edge. The
+    domain is the ball in which the posterior is valid.
     """
     f = check_contacts(contacts).fingertips
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
@@ -183,10 +187,11 @@ def node_covariance(
     """Return the posterior covariance of signed distance d and gradient w at all nodes of the
     lines.
 
-    The z = 20 f values of a contact set are ordered by line, then by node. They are d and w along
-    the normal and two tangents. `points` and `normals` (b, f, 3) are normalised contacts and
-    outward unit normals. `nodes` are normalised positions on the lines; those outside the domain
-    are moved to its edge. The gradient is a difference quotient over a fingertip's width.
+    The z = 20 f values of a contact set are ordered by line, then by node. Each node has four: d,
+    then the parts of w along the normal and two tangents. `points` and `normals` (b, f, 3) are
+    normalised contacts and outward unit normals. `nodes` are normalised positions on the lines.
+    Nodes outside the ball in which the shape is known are moved to its edge. The gradient is a
+    difference quotient over a fingertip's width.
     """
     width = FOOTPRINT / shape.scale
     along = dot(points, normals)
@@ -315,9 +320,10 @@ def closure_probability(
 
 def drawn_contacts(lines: LinePosterior, n: int, seed: int) -> tuple[TouchPoints, TouchPoints]:
     """Return points (normalised) and outward unit normals at which fingertips touch n random
-    surfaces, drawn with a seed on `lines`.
+    surfaces.
 
-    Both have the shape (b, n, f, 3), and are NaN where a line meets no surface.
+    The surfaces are drawn with a `seed` from the Gaussian `lines`. Both results have the shape (b,
+    n, f, 3), and are NaN where a line meets no surface.
     """
     # the draws are the same for all that torch.vmap maps over
     with torch._C._DisableFuncTorch():

@@ -41,7 +41,12 @@ from torchgrasp.shape.kernel import is_plain
 
 @dataclasses.dataclass(frozen=True)
 class CriticalNumbers:
-    """Parameters of Newton's method for the critical friction."""
+    """Parameters of Newton's method for the critical friction.
+
+    It is an interior-point method. mu is the friction coefficient. nu is the product of a cone and
+    its multiplier, which falls towards 0. a_i are the normal forces, and s_i0 the multipliers of
+    the cones along the inward normals. The sum of a_i s_i0 should be 1.
+    """
 
     most: float = 10.0
     """Greatest friction coefficient; contacts that need more count as unable to balance."""
@@ -147,18 +152,20 @@ def critical_friction(
 def least_balance(
     points: Vectors, normals: Vectors, load: Float[Tensor, "b 6"] | None = None
 ) -> tuple[Int[Tensor, "k"], LeastBalance]:
-    """Return the indices of the k contact sets that can balance, and their balances.
+    """Return the indices of the k contact sets that can balance, and their balances of least
+    friction.
 
-    The balances are differentiable twice in all arguments. Where several motions of the object
-    prove the friction, its derivative is that of one of them. Inside torch.vmap, all sets have an
-    index. For those that cannot balance the friction is NaN, and the other fields mean nothing.
+    The balances are differentiable twice in all arguments. At a kink, where several derivatives are
+    possible, the derivative is one of them. Inside torch.vmap, all sets have an index. For those
+    that cannot balance the friction is NaN, and the other fields mean nothing.
 
     Args:
-        points: positions [m] of f contacts.
-        normals: outward unit normals of the object.
-        load: wrench that the contacts balance, in the units of `scaled_arms`, over the mean normal
-            force; None means no load. Few sets fail to converge, most of them under loads far below
-            the normal forces.
+        points: positions (b, f, 3) [m] of the f contacts of each set.
+        normals: outward unit normals (b, f, 3) of the object, in the same frame.
+        load: wrench (force, then torque about the contacts' centroid) that the contacts balance.
+            Forces are divided by the mean normal force, and lengths by the root-mean-square radius
+            of the contacts. None means no load. Few sets fail to converge, most of them under loads
+            far below the normal forces.
     """
     load = points.new_zeros(len(points), 6) if load is None else load
     good, *parts = _Search.apply(points.detach(), normals.detach(), load.detach())

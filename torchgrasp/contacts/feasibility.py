@@ -163,7 +163,8 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
     """Return contact sets at normalised `points` (b, f, 3) as a plan, after a check of all
     constraints.
 
-    The `status` of a set is that of the first constraint of `problem` which it violates.
+    The `status` of a set is that of the first constraint of `problem` which it violates, else
+    `Status.OK`.
     """
     spec = problem.spec
     scale = shape.scale

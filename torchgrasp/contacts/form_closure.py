@@ -296,7 +296,7 @@ def closed_exact(
 
     `points` and outward unit `normals` have the shape (b, f, 3), and `friction` is the coefficient
     of friction. `guess` holds the coefficients (b, m) that `first_balance` gives for similar
-    contacts, which save time.
+    contacts, which save time. None means no guess.
     """
     if points.shape[1] == 3:
         if is_fused(points, normals):

@@ -269,7 +269,12 @@ def descend(
     state: "solver.State",
     stage: "solver.Stage",
 ) -> "solver.State":
-    """Return the solver's state after one stage, as the function `descend` of the solver."""
+    """Return the solver's state after the Levenberg-Marquardt steps of one stage that begins with
+    `state`.
+
+    `shape` is the surface, `problem` holds the constraints, and `stage` their weights and the
+    number of steps.
+    """
     f = state.points.shape[1]
     pairs = constraint.contact_pairs(f, state.points.device)
     signs = constraint.pull_signs(f, state.points.device)

@@ -86,8 +86,12 @@ def pivot(
     bounds: Float[Tensor, "b m d"],
     numbers: tuple[int, float, float, float],
 ) -> tuple[Int[Tensor, "b d"], Float[Tensor, "b d"]]:
-    """Return the results of `_pivot` of `form_closure`. The numbers are its bounds of pivots, zero
-    multipliers, the artificial rows' gain and parallel bounds.
+    """Return for each of b linear programmes the indices of its d tight bounds, then a direction.
+
+    The programmes are: maximise a.v with c_k.v <= 1 for m bounds c_k. `objective` holds a, and
+    `bounds` the c_k. An index is -1 for an artificial bound, one of v = 0, that stayed tight. The
+    direction is that in which a.v grows without bound, or 0. The four `numbers` are `PIVOTS`,
+    `OPTIMAL`, `ARTIFICIAL_GAIN` and `BLOCKING` of `form_closure`.
     """
     tight = objective.new_full(objective.shape, -1).long()
     ray = objective.new_zeros(objective.shape)

@@ -110,10 +110,12 @@ def closed_in_plane(
     parallel: float,
     flat: float,
 ) -> Bool[Tensor, "b"]:
-    """Return the results of `closed_exact` of `form_closure` for three contacts.
+    """Return a mask of the sets of three contacts with frictional form closure under round cones.
 
-    Planar wrenches with a cross product shorter than `parallel` are parallel. `flat` is the bound
-    of `degenerate`.
+    `points` [m] and outward unit `normals` are in one frame, and `friction` is the coefficient of
+    friction. Planar wrenches with a cross product shorter than `parallel` count as parallel.
+    Contacts count as on a line if their triangle is small. Twice its area is then at most `flat`
+    times the square of its longest side.
     """
     closed = points.new_zeros(len(points)).bool()
     cone = math.cos(math.atan(friction))

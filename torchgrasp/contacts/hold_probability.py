@@ -62,10 +62,11 @@ class HoldProbabilityNumbers:
     """Parameters of `hold_probability`."""
 
     points: int = 64
-    """Number of errors around which the critical friction is found and linearised."""
+    """Number of samples of the errors around which the critical friction is found and linearised.
+    """
     local: float = 0.2
-    """Standard deviation of the errors around each of them, as a share of the whole one. Where the
-    critical friction has a kink, the result is too high by about as much.
+    """Standard deviation of the errors around each sample, as a share of that of all errors. Where
+    the critical friction has a kink, the result is too high by about as much.
     """
     rows: int = 2**15
     """Rows, contact sets with one error each, that are computed at a time: this bounds memory."""
@@ -385,8 +386,11 @@ def _tilts(tilt: float | Tensor, points: Vectors) -> Float[Tensor, "b f"]:
 def sensitivities(
     points: Vectors, normals: Vectors, balance: LeastBalance
 ) -> tuple[Vectors, Vectors]:
-    """Return the derivatives of the critical friction with respect to points [1/m] and normals,
-    along the surface. `balance` is that of the contacts.
+    """Return the derivatives of the critical friction with respect to points [1/m] and normals (no
+    unit).
+
+    They have the shape (b, f, 3), and only their parts along the surface. `points` [m] and outward
+    unit `normals` are in one frame. `balance` holds the contacts' forces of least friction.
     """
     _, radius = centre_and_radius(points)
     rotation = balance.twist[:, None, 3:].expand_as(points)

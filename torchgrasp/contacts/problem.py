@@ -165,8 +165,10 @@ def triple_jet(shape: ShapeLike, points: Vectors) -> SurfaceJet:
 
 
 def variance_at(shape: ShapeLike, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
-    """Return the variance of the signed distance at normalised points, without its derivatives if
-    possible.
+    """Return the variance (q,) of the signed distance at q normalised points, in squared normalised
+    units.
+
+    Its derivatives are not computed if possible.
     """
     variance = getattr(shape, "variance", None)
     return shape.jet(x).variance if variance is None else variance(x)
@@ -287,7 +289,9 @@ class Face(NamedTuple):
 
     @classmethod
     def of(cls, plane: Plane, shape: ShapeLike) -> "Face":
-        """Return a plane [m] in the units of a shape, or of each shape of a batch."""
+        """Return the face of a `plane` [m] in the normalised units of a shape; `shape` may be a
+        batch.
+        """
         outward = plane.normal.to(device_of(shape))
         foot = plane.offset * plane.normal
         scale = shape.scale
@@ -297,14 +301,18 @@ class Face(NamedTuple):
         return cls(outward, float(shape.normalise(foot) @ plane.normal))
 
     def rows(self, index: Int[Tensor, "k"]) -> "Face":
-        """Return the face in the units of the contact sets with the indices `index`."""
+        """Return the face in normalised units of the k contact sets with the indices `index`."""
         offset = self.offset
         return Face(self.outward, offset[index]) if isinstance(offset, Tensor) else self
 
     def room(
         self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], tip_radius: PerRow
     ) -> Float[Tensor, "*b"]:
-        """Return how far (normalised) the round fingertip on each contact is from the face."""
+        """Return how far (normalised) the round fingertip on each contact is outside the face.
+
+        It is negative where the fingertip reaches through the face. `points` are normalised
+        contacts, `normals` their outward unit normals. `tip_radius` is normalised.
+        """
         away = self.outward.to(points)
         height = points @ away
         slant = 1 - normals @ away
@@ -319,10 +327,10 @@ class ContactProblem:
     constraints in metres; all else is normalised. `friction` is the coefficient of the largest
     round cone inside the friction cone with flat sides that `certify` uses. `domain_radius` is that
     of the shape. `separation` is the least distance of two fingertip centres, and `tip_radius` the
-    radius of the fingertips. `ring` is the radius within which the surface is flat. `table` are the
-    faces of the table. They are none without a table, its top, and its side if it has an edge.
-    `beyond` returns the signed distance (q,) of normalised points (q, 3) from the region where
-    contacts may be, negative inside.
+    radius of the fingertips. `ring` is the radius within which the surface is flat. `table` holds
+    the top of the table, then its side if it has an edge; it is empty without a table. `beyond`
+    returns the signed distance (q,) of normalised points (q, 3) from the region where contacts may
+    be, negative inside.
     """
 
     spec: ContactSpec
@@ -366,7 +374,7 @@ class ContactProblem:
         )
 
     def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
-        """Return the problem of the k contact sets with the indices `index`."""
+        """Return the problem of the k contact sets with the indices `index` in the batch."""
         names = "domain_radius", "separation", "tip_radius", "ring"
         own = {name: x[index] for name in names if isinstance(x := getattr(self, name), Tensor)}
         if not own:  # of one shape for all contact sets

@@ -191,9 +191,10 @@ class Region(Value):
 def combine(
     keep: Distance | None, avoid: Distance | None, also: Distance | None = None
 ) -> Distance | None:
-    """Return the region inside `keep` and `also` and outside `avoid`; None if none is given.
+    """Return the region inside `keep` and `also` and outside `avoid`; None if all three are None.
 
-    Each is a function of points (n, 3) [m] that returns their signed distances [m], or None.
+    Each is a function of points (n, 3) [m] in one frame, or None. It returns their signed distances
+    (n,) [m], negative inside.
     """
     named = ("keep", keep, 1), ("spec.region", also, 1), ("avoid", avoid, -1)
     parts = [
@@ -207,9 +208,10 @@ def combine(
 
 
 def seen_from(region: Distance | None, obj_from_frame: Float[Tensor, "4 4"]) -> Distance | None:
-    """Return a region of the frame `obj` as a function of points [m] in another frame.
+    """Return the signed distance [m] from a region as a function of points [m] in another frame.
 
-    `obj_from_frame` is the transform from that frame. None stays None.
+    `region` takes points in the frame `obj`, and `obj_from_frame` [m] is the transform from the
+    other frame. None stays None.
     """
     if region is None:
         return None

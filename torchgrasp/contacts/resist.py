@@ -32,9 +32,9 @@ from torchgrasp.values.specs import ContactSpec
 
 
 class Resisted(NamedTuple):
-    """The greatest multiple of the worst load that each of b contact sets resists, with a proof.
+    """The greatest multiple of the worst load that each of b contact sets resists.
 
-    It proves that no greater multiple is possible.
+    `twist` proves that no greater multiple is possible.
 
     Args:
         margin: the greatest multiple s (no unit) of the load that the contacts resist; 0 if it is
@@ -66,7 +66,8 @@ def resist_loads(
         points: contacts [m] (b, f, 3).
         normals: outward unit normals (b, f, 3).
         strength: greatest normal force [N] of each contact.
-        loads: forces [N], then torques [N m] about the origin of the points' frame.
+        loads: w loads of each set: force [N], then torque [N m] about the origin of the points'
+            frame.
         spec: its `planned_friction` and `edges` define the friction cones.
     """
     count = loads.shape[1]
@@ -97,7 +98,7 @@ def share_carried(
     """Return which share, at most 1, of a load each of b contact sets can carry.
 
     Args:
-        contacts: the contact sets.
+        contacts: b sets of f contacts [m] with outward unit normals.
         strength: greatest normal force [N] of each contact.
         load: force [N], then torque [N m] about the centroid of the contacts.
         spec: its `planned_friction` and `edges` define the friction cones.

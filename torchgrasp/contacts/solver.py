@@ -60,9 +60,10 @@ BOUNDS = 3.0  # weight of all bounds but the cones, as great as that of the cone
 class Stage:
     """A solver stage: at most `steps` steps with given weights of the constraints.
 
-    `centre` and `cones` are the weights (no unit) of the offset from the centre, and of the
-    friction cones. A contact set stops when its step (normalised) is shorter than `settled`. Unless
-    `exact`, the variance of the surface is extrapolated linearly.
+    `centre` and `cones` are weights without unit. `centre` is that of the centroid's offset from
+    the normalised origin, and `cones` that of the friction cones. A contact set stops when its step
+    (normalised) is shorter than `settled`. Unless `exact`, the variance of the surface is
+    extrapolated linearly.
     """
 
     centre: float
@@ -81,8 +82,9 @@ class State(Batch):
     """The solver's state for b contact sets of f contacts.
 
     `points` (b, f, 3) are the normalised contacts. `tension` (b, p) is that of each of p pairs of
-    contacts (see `contacts.problem`). Its scale makes the mean size of the contact forces 1. `jet`
-    holds signed distance and variance of the surface at the points, with derivatives.
+    contacts: the two pull each other with the force tension times distance. Its scale makes the
+    mean size of the contact forces 1. `jet` holds signed distance and variance of the surface at
+    the points, with derivatives.
     """
 
     points: Vectors
@@ -92,7 +94,7 @@ class State(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
-    """The linearised constraints of contact sets, a in number.
+    """The linearised constraints of a contact sets (the letter a is their number).
 
     `residual` holds r constraints times their `weight` (no unit; `Constraints` gives the units of
     the values). `jacobian` holds the derivatives of the constraints, without weights, with respect

@@ -43,7 +43,8 @@ def check_starts(shape: ShapeLike, spec: ContactSpec, starts: int | Tensor) -> N
     """Raise `BadArgument` for initial guesses with a wrong number of contacts, or outside the
     shape's domain.
 
-    `starts` is a number of random guesses, or contact points (b, f, 3) [m].
+    The domain is the ball in which the shape is known. `starts` is a number of random guesses, or
+    contact points (b, f, 3) [m].
     """
     if isinstance(starts, Tensor):
         if starts.ndim == 3 and starts.shape[1] != spec.fingertips:
@@ -65,17 +66,19 @@ def check_starts(shape: ShapeLike, spec: ContactSpec, starts: int | Tensor) -> N
 
 
 def given_starts(shape: ShapeLike, starts: Vectors) -> Iterator[Float[Tensor, "_ f 3"]]:
-    """Yield the caller's initial contact points [m] in chunks, moved onto the surface, in
-    normalised units.
+    """Yield the caller's initial contact points in chunks of at most 500 sets, moved onto the
+    surface, in normalised units.
 
-    `starts` have the shape (b, f, 3).
+    `starts` (b, f, 3) [m] are in the frame of the shape's cloud.
     """
     for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
 
 
 def start_chunks(starts: int) -> list[int]:
-    """Return the sizes of the chunks in which a number of initial guesses is planned."""
+    """Return the sizes of the chunks in which `starts` initial guesses are planned: 500, the last
+    one fewer.
+    """
     return [min(STARTS_PER_CHUNK, starts - begin) for begin in range(0, starts, STARTS_PER_CHUNK)]
 
 
@@ -117,10 +120,11 @@ def drawn_starts(
 def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandidates:
     """Return the constraints with a known `flat_radius`, and candidate contacts.
 
-    A radius that is not given is the largest of `FLAT_RADII` with which enough guesses have force
-    closure. If there is none, it is the least of them. The candidates are the points at which the
-    surface is flat. They are all points of `survey` if too few points are flat. They are None if
-    `spec` demands no flatness.
+    If `spec.flat_radius` is None, one of 8, 6, 4 and 3 mm (`FLAT_RADII`) is chosen. It is the
+    largest with which enough random guesses have force closure, else 3 mm. The candidates are
+    random surface points at which the surface is flat. If fewer points than fingertips are flat,
+    the candidates are all drawn points. They are None if `spec` demands no flatness. `seed` draws
+    the points.
     """
     if spec.flatness is None:
         return FlatCandidates(spec, None)
@@ -178,9 +182,9 @@ def draw_in(shape: ShapeLike, points: Vectors) -> Vectors:
     """Return contact sets as initial guesses; sets with a point far from the surface are moved to
     the origin.
 
-    `points` (b, f, 3) are normalised. A set that is moved has its centroid at the origin, and is
-    shrunk to a radius of `NEAR_CENTRE`. Projected from there, its points spread over the surface;
-    from afar all would end on the nearest surface.
+    `points` (b, f, 3) are normalised. Far is farther than 0.1 (`FAR`). A moved set has its centroid
+    at the origin, and is shrunk to a radius of at most 0.1 (`NEAR_CENTRE`). Projected from there,
+    its points spread over the surface; from afar all would end on the nearest surface.
     """
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
@@ -197,8 +201,8 @@ def qualify(
     points.
 
     `points` (b, f, 3) are normalised; the normals are outward unit vectors. A contact may lie on
-    the surface, where its variance is low, and in the domain. It must also be above the table, and
-    in the region.
+    the surface, where its variance is below `spec.max_variance`. It must also be above the table
+    and in the region of `spec`. The shape is known in a ball, which must contain it.
     """
     problem = ContactProblem.of(shape, spec)
     distance, gradient = (
@@ -220,10 +224,11 @@ def candidate_rows(
     starts: int,
     generator: torch.Generator,
 ) -> Vectors:
-    """Return random sets (b, f, 3) of candidate contacts, most of which are good.
+    """Return b = `starts` random sets (b, f, 3) of candidate contacts, normalised.
 
-    The arguments are those of `good_sets`, and `starts` is the number b of sets. If too few of the
-    drawn sets are good, the rest are any candidates.
+    They have force closure, and contacts far enough from each other, as `problem` demands. If too
+    few of the drawn sets are so, the rest are any candidates. `points` (p, 3) are the normalised
+    candidates, `normals` (p, 3) their outward unit normals. `generator` draws the sets.
     """
     rows = []
     missing = starts
@@ -243,12 +248,13 @@ def good_sets(
     starts: int,
     generator: torch.Generator,
 ) -> Iterator[Int[Tensor, "_ f"]]:
-    """Yield random sets of candidates, given by their indices, in portions that are judged when
-    they are asked for.
+    """Yield good random sets of contacts, as indices of the candidates, in portions that are
+    computed on demand.
 
     Good sets have force closure, and contacts far enough from each other, as `problem` demands.
-    `points` (p, 3) are the normalised candidates, `normals` (p, 3) their outward unit normals.
-    `generator` draws some sets for each of the `starts` in each of a few rounds.
+    `points` (p, 3) are the normalised candidates, `normals` (p, 3) their outward unit normals. In
+    each of 8 rounds (`ROUNDS`), `generator` draws 20 sets (`DRAWN_PER_START`) for each of `starts`
+    wanted sets.
     """
     for _ in range(ROUNDS):
         drawn = draw_sets(len(points), DRAWN_PER_START * starts, problem.spec.fingertips, generator)
@@ -264,7 +270,10 @@ def good_sets(
 def draw_sets(
     candidates: int, sets: int, fingertips: int, generator: torch.Generator
 ) -> Int[Tensor, "s f"]:
-    """Return random indices of candidates on the CPU, one for each fingertip of each set."""
+    """Return random indices from 0 to `candidates` - 1, on the CPU, for s `sets` of f contacts.
+
+    f is the number of `fingertips`. A set may hold a candidate twice.
+    """
     return torch.randint(candidates, (sets, fingertips), generator=generator, device="cpu")
 
 

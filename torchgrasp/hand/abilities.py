@@ -194,7 +194,7 @@ def hand_abilities(hand: Hand, postures: Count = 5000, seed: Seed = 0) -> HandAb
 
 
 def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
-    """Return n random postures of the h actuated joints, uniform within the joint limits [rad]."""
+    """Return n random postures of the h actuated joints [rad or m], uniform within their limits."""
     share = torch.rand(
         n,
         hand.dof,

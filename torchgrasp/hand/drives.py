@@ -8,8 +8,10 @@ from torchgrasp.hand.hand import Actuator, Hand
 
 
 def stiff_drives(hand: Hand, kp: float | None) -> dict[str, Actuator]:
-    """Return the drive of each joint by its name; `kp` [N m/rad], if given, replaces the stiffness
-    of all.
+    """Return the drive of each movable joint by its name.
+
+    `kp` [N m/rad, or N/m for sliding joints] replaces the stiffness of all drives. None keeps the
+    hand's own.
     """
     if kp is None:
         return hand.actuators
@@ -17,8 +19,11 @@ def stiff_drives(hand: Hand, kp: float | None) -> dict[str, Actuator]:
 
 
 def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
-    """Return the drive stiffness [N m/rad] of each joint of the URDF: `kp` if given, else the
-    hand's own.
+    """Return the drive stiffness [N m/rad, or N/m for sliding joints] of each movable joint of the
+    URDF.
+
+    It is `kp` for all joints; None means the hand's own. The j joints are in the order of
+    `Hand.tree.joint_names`.
     """
     drives = stiff_drives(hand, kp)
     kps = [drives[name].kp for name in hand.tree.joint_names]
@@ -26,25 +31,30 @@ def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
 
 
 def drive_efforts(hand: Hand) -> Float[Tensor, " j"]:
-    """Return the largest torque [N m] of the drive of each joint of the URDF."""
+    """Return the largest torque [N m] of the drive of each of the j movable joints of the URDF.
+
+    They are in the order of `Hand.tree.joint_names`. For a sliding joint it is a force [N].
+    """
     efforts = [hand.actuators[name].effort for name in hand.tree.joint_names]
     return torch.tensor(efforts, dtype=torch.float64, device="cpu")
 
 
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint, together with the joints coupled to
-    it.
+    """Return the stiffness [N m/rad] of each of h actuated joints, together with the joints coupled
+    to it.
 
-    `kp` [N m/rad], if given, replaces the stiffness of every drive.
+    `kp` [N m/rad] replaces the stiffness of every drive; None means the hand's own. For sliding
+    joints units are [N/m].
     """
     return coupled_stiffness(hand, drive_stiffness(hand, kp))
 
 
 def coupled_stiffness(hand: Hand, drives: Float[Tensor, " j"]) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint, together with the joints coupled to
-    it.
+    """Return the stiffness [N m/rad] of each of h actuated joints, together with the joints coupled
+    to it.
 
-    `drives` [N m/rad] are the stiffnesses of the drives of all joints of the URDF.
+    `drives` [N m/rad] are the stiffnesses of the drives of all j movable joints of the URDF. For
+    sliding joints units are [N/m].
     """
     coupling = hand.actuated.coupling
     return (coupling**2 * drives.to(coupling)[:, None]).sum(0)

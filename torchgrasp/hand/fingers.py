@@ -113,8 +113,8 @@ class ActuatedJoints(Value):
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
         """Raise `BadArgument` unless all `joints` are within their limits.
 
-        A limit may be exceeded by the rounding of float32. Whatever `check` refuses also raises
-        `BadArgument`.
+        A limit may be exceeded by 1e-6 (`ROUNDING`), the rounding of float32. A wrong count, dtype
+        or device also raises `BadArgument`, and so does a number that is not finite.
 
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.
@@ -141,8 +141,9 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
     """Return the actuated joints: those of the grasping fingers, and the joints that their coupled
     joints follow.
 
-    Raises `HandFileError` if the limit margin leaves an empty range, or for a joint that neither
-    grasps nor is parked.
+    `spec` is the content of hand.toml. Raises `HandFileError` if its limit margin leaves an empty
+    range. Raises it also if an option of hand.toml gives no position to a joint that does not
+    grasp.
     """
     movable = {j.name: j for j in urdf.movable}
     own = [j for f in spec.fingers for j in f.joints]
@@ -262,8 +263,9 @@ class Fingertips(Value):
 
 
 def tips_from_files(spec: HandSpec, urdf: Urdf, chain: Any) -> Fingertips:
-    """Return the fingertips of the grasping fingers, from hand.toml, the URDF and its
-    pytorch-kinematics `chain`.
+    """Return the fingertips of the grasping fingers.
+
+    `spec` is the content of hand.toml, and `chain` the pytorch-kinematics chain of the URDF.
     """
     links = [x.name for x in urdf.links]
     tips = tuple(f.tip_link for f in spec.fingers)

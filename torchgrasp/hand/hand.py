@@ -144,7 +144,8 @@ class Hand(Value):
         """Tables of how collision spheres, fingertips and pad normals move with the hand's pose and
         joints.
 
-        It is a cached property that serves `solve_ik` alone. Its class `FreeMotion` is not public.
+        It is a cached property that only inverse kinematics uses, as in `solve_ik`. Its class
+        `FreeMotion` is not public.
         """
         spheres = self.collision_spheres
         tips = self.tips

@@ -36,11 +36,11 @@ _DOTTED = re.compile(rf"""(?<![\w"'-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{16}}""")
 
 
 class Pad(NamedTuple):
-    """The surface of a fingertip that may touch: a sphere, or a point (radius 0).
+    """The surface of a fingertip that may touch objects: a sphere, or a point (radius 0).
 
-    All is in the frame of the tip's link. `contact` [m] is its contact point, and `normal` the
-    outward unit normal there. `center` [m] is the centre of the sphere, or the contact point, and
-    `radius` [m] its radius.
+    All is in the frame of the tip's link. `contact` [m] is the pad's contact point, and `normal`
+    the outward unit normal there. `center` [m] is the centre of the sphere, and `radius` [m] its
+    radius. The center of a point is the contact point.
     """
 
     contact: Triple
@@ -117,13 +117,16 @@ class HandSpec:
     data: bytes
 
     def wrong(self, found: str, allowed: str) -> HandFileError:
-        """Return the error to raise if hand.toml has `found` in place of `allowed`."""
+        """Return the error to raise if hand.toml has what the text `found` says in place of
+        `allowed`.
+        """
         return HandFileError("hand.toml", f"{self.path}: {found}", allowed)
 
 
 def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
     """Read and check a hand.toml, with the chosen grasping `fingers`.
 
+    `fingers` are the name of an option of hand.toml, a number of fingers, or names of fingers.
     Raises `HandFileError` for a missing or malformed file, and `BadArgument` for fingers that the
     hand lacks.
     """
@@ -317,7 +320,10 @@ def _coupling(field: Field) -> dict[str, Mimic]:
 
 
 def leading(coupling: Mapping[str, Mimic], joints: Collection[str]) -> set[str]:
-    """Return the names of the joints that the coupled joints among `joints` follow."""
+    """Return the names of the joints that the coupled joints among `joints` follow.
+
+    `joints` holds names, and `coupling` gives the coupled joints by name.
+    """
     return {name for joint in joints if joint in coupling for name, _ in coupling[joint].terms}
 
 

@@ -225,10 +225,10 @@ class FreeMotion(Value):
 def map_points(
     frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "3 p n"]:
-    """Return p points [m] in the root's frame.
+    """Return p points [m] in the root's frame, in n postures.
 
-    `frames` holds a link frame (3 x 4) for each point in each of n postures, `local` [m] the point
-    in it.
+    `frames` holds the pose (3 x 4) [m] of each point's link in the root's frame. `local` [m] holds
+    the points in the frames of their links.
     """
     return map_directions(frames, local) + frames[:, 3]
 
@@ -236,10 +236,10 @@ def map_points(
 def map_directions(
     frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "3 p n"]:
-    """Return p directions in the root's frame, in the unit of `local`.
+    """Return p directions in the root's frame, in n postures and in the unit of `local`.
 
-    `frames` holds a link frame (3 x 4) for each direction in each of n postures, `local` the
-    direction in it.
+    `frames` holds the pose (3 x 4) [m] of each direction's link in the root's frame. `local` holds
+    the directions in the frames of their links.
     """
     x, y, z = local.to(frames)[:, :, None].unbind(1)
     mapped = torch.addcmul(frames[:, 0] * x, frames[:, 1], y)
@@ -249,7 +249,7 @@ def map_directions(
 def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.chain.Chain":
     """Return a URDF as a pytorch-kinematics chain of independent joints, in float64.
 
-    The library's own reader has float32.
+    The reader of pytorch-kinematics gives float32.
     """
     frame = pytorch_kinematics.frame
     with torch.device("cpu"):  # the library makes some tensors on torch's default device
@@ -270,10 +270,10 @@ def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.chain.Chain":
 def tree_from_urdf(
     urdf: Urdf, chain: Any = None, ends: Collection[str] | None = None
 ) -> KinematicTree:
-    """Return the kinematic tree of a URDF's `chain`, with links in the order of the URDF.
+    """Return the kinematic tree of a URDF, with links in the order of the URDF.
 
-    With `ends`, it is the part of the tree that leads to these links. Without a `chain`, it is
-    made.
+    `chain` is the URDF as a pytorch-kinematics chain; None means that it is made here. `ends` holds
+    names of links: the result is then the part of the tree that leads to them. None means all.
     """
     model: Any = chain or chain_from_urdf(urdf)  # it declares no types
     index = model.frame_to_idx
@@ -315,10 +315,11 @@ def tree_from_urdf(
 def chain_poses(
     chain: "pytorch_kinematics.chain.Chain", names: Sequence[str], values: Float[Tensor, "j n"]
 ) -> Float[Tensor, "c n 4 4"]:
-    """Return the poses [m] of a chain's c frames in n postures, computed by pytorch-kinematics.
+    """Return the poses (c, n, 4, 4) [m] of a chain's c frames in the root's frame, by
+    pytorch-kinematics.
 
-    `values` [rad or m] holds the positions of all joints by `names`. Raises `BadArgument` inside
-    torch.vmap.
+    `values` (j, n) [rad or m] holds n postures of all j movable joints, in the order of `names`.
+    Raises `BadArgument` inside torch.vmap.
     """
     if not (torch.compiler.is_compiling() or is_known(values)):
         raise BadArgument(

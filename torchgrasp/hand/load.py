@@ -123,7 +123,7 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
 
     Args:
         hand: the hand.
-        fingers: the grasping fingers, as in `load_hand`.
+        fingers: the grasping fingers, as in `load_hand`: an option's name, a number, or names.
 
     Raises the errors of `load_hand`.
 

@@ -68,14 +68,18 @@ be omitted.
 
 
 class BoundedBuilder(ET.TreeBuilder):
-    """An XML tree builder that rejects too many elements and too deep nesting."""
+    """An XML tree builder that rejects more than 50,000 elements, or elements nested more than 64
+    deep.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.depth = self.count = 0
 
     def start(self, tag: Any, attrs: Any) -> Any:
-        """Count the start of an element; raise `HandFileError` for too many or too deep ones."""
+        """Count the start of an element; raise `HandFileError` for too many elements or too deep
+        nesting.
+        """
         self.depth = self.depth + 1
         self.count = self.count + 1
         if self.depth > XML_DEPTH or self.count > XML_ELEMENTS:
@@ -90,8 +94,10 @@ class BoundedBuilder(ET.TreeBuilder):
 
 
 def bounded_tree(data: bytes | str) -> ET.Element:
-    """Return the tree of an XML text. Raises `HandFileError` for too many elements or too deep
-    nesting, `ParseError` or `ValueError` for another fault.
+    """Return the element tree of an XML text.
+
+    Raises `HandFileError` for more than 50,000 elements, or a nesting more than 64 deep. Raises
+    `ParseError` or `ValueError` for another fault.
     """
     return ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
 
@@ -100,7 +106,8 @@ def parse_urdf(path: Path, data: bytes, visual: bool = False) -> ET.Element:
     """Return the XML tree of a URDF with only links and joints, and with checked numbers.
 
     `data` are the bytes of the file; `path` is named in errors. With `visual`, a link without
-    <collision> has its <visual> in its place. Raises `HandFileError` for anything else.
+    <collision> has its <visual> in its place. Raises `HandFileError` for malformed XML, for unknown
+    elements, and for numbers that are missing or not finite.
     """
     # also within comments: a declaration may be hidden by a processing instruction that looks like
     # a comment
@@ -147,16 +154,17 @@ def parse_urdf(path: Path, data: bytes, visual: bool = False) -> ET.Element:
 def seen_links(data: bytes) -> tuple[str, ...]:
     """Return the names of the links with a <visual> but no <collision>.
 
-    `data` are the bytes of a file that `parse_urdf` took.
+    `data` are the bytes of a URDF that `parse_urdf` has accepted.
     """
     robot = bounded_tree(data)
     return tuple(link.get("name", "") for link in _seen_only(robot))
 
 
 def soft_limits(data: bytes) -> dict[str, tuple[float, float]]:
-    """Return the soft limits [rad or m] of joints by name, where a <safety_controller> has both.
+    """Return the soft limits (lower, upper) [rad or m] of joints by the joint's name.
 
-    `data` are the bytes of a file that `parse_urdf` took.
+    Joints whose <safety_controller> lacks one of the two are left out. `data` are the bytes of a
+    URDF that `parse_urdf` has accepted.
     """
     robot = bounded_tree(data)
     found = {}

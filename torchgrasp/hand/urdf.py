@@ -46,11 +46,14 @@ class Mimic(NamedTuple):
 
     @property
     def terms(self) -> tuple[tuple[str, float], ...]:
-        """All joints that are followed, each with its ratio."""
+        """Names of all joints that this joint follows, each with its ratio."""
         return (self.source, self.ratio), *self.others
 
     def follow(self, positions: Mapping[str, Any]) -> Any:
-        """Return the position [rad or m], given those of the joints that are followed by name."""
+        """Return the position [rad or m] of the coupled joint.
+
+        `positions` holds those of the joints that it follows, by their names.
+        """
         value = self.ratio * positions[self.source] + self.offset
         for source, ratio in self.others:
             value = value + ratio * positions[source]
@@ -150,7 +153,9 @@ class Urdf:
 
     @checked
     def wrong(self, found: str, allowed: str) -> HandFileError:
-        """Return the error to raise if the URDF has `found` in place of `allowed`."""
+        """Return the error to raise if the URDF has what the text `found` says in place of
+        `allowed`.
+        """
         return HandFileError("urdf", f"{self.path}: {found}", allowed)
 
     @functools.cached_property
@@ -195,8 +200,8 @@ def pose_of(part: Joint | LinkShape) -> Float[np.ndarray, "4 4"]:
 def read_urdf(path: Path | str) -> Urdf:
     """Read a URDF that the library can use as it is.
 
-    It has no meshes, no joints without limits, and no chains of coupled joints. Raises
-    `HandFileError` for others, and for a missing or malformed file.
+    Raises `HandFileError` for a missing or malformed file. Raises it also for collision meshes,
+    joints without limits, and coupled joints that follow a coupled joint.
     """
     urdf = read_published(path)
     for link in urdf.links:
@@ -229,9 +234,10 @@ def read_published(path: Path | str, visual: bool = False) -> Urdf:
 
 
 def read_visuals(path: Path, data: bytes) -> dict[str, tuple[LinkShape, ...]]:
-    """Return the <visual> of each link by its name, given the bytes of a URDF that was read.
+    """Return the visual shapes (<visual>) of each link by its name.
 
-    Pictures alone use them: the dict is empty if any of them is malformed.
+    `data` are the bytes of a URDF that `read_urdf` or `read_published` has accepted, and `path` is
+    named in errors. Only pictures use these shapes: the dict is empty if any is malformed.
     """
     robot = bounded_tree(data)
     for link in robot.findall("link"):

@@ -40,7 +40,7 @@ def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
     """Return the contact set of each initial guess, with its contacts reordered so that contact i
     belongs to finger i.
 
-    `contacts` are all sets; `seeds.row` holds the index of each guess's set.
+    `contacts` are all sets; `seeds.row` holds the index of each guess's set among them.
     """
     return map_tensors(lambda x: x[seeds.row[:, None], seeds.permutation], contacts)
 
@@ -49,9 +49,9 @@ class Attempts(Generic[Result]):
     """The results of all refined initial guesses so far, and a mask of the contact sets without a
     good one.
 
-    `unsolved` is this mask of the b contact sets. `solves` returns a mask (k,) of the good ones
-    among k results. `results` are the added groups of results, such as `Grasps`. `rows` holds for
-    each group the index of each result's contact set.
+    `unsolved` is this mask (b,) of the b contact sets. `solves` is a function of k results that
+    returns a mask (k,) of the good ones. `results` are the added groups of results, such as
+    `Grasps`. `rows` holds for each group the index of each result's contact set.
     """
 
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
@@ -61,7 +61,9 @@ class Attempts(Generic[Result]):
         self.rows = list[Tensor]()
 
     def add(self, results: Result, row: Int[Tensor, "k"]) -> None:
-        """Add k `results`; `row` holds the index of the contact set of each."""
+        """Add k `results`; `row` holds the index of the contact set of each. The contact sets of
+        good results become solved.
+        """
         self.results.append(results)
         self.rows.append(row)
         self.unsolved = self.unsolved.index_fill(0, row[self.solves(results)], False)
@@ -93,7 +95,7 @@ class Attempts(Generic[Result]):
                 self.add(refine(chosen), chosen.row)
 
     def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
-        """Return the best result of each contact set that has one, t in all. Return then the
+        """Return the best result of each contact set that has results, t in all. Return then the
         indices (t,) of these contact sets.
 
         `keys` returns tensors (k,) for k results. The best result has the least first key; in a tie
@@ -111,8 +113,8 @@ def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
 
 
 def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
-    """Return the best grasp of each contact set that has one in `attempts`, t in all. Return then
-    the indices (t,) of these contact sets.
+    """Return the best grasp of each contact set that has a grasp in `attempts`, t in all. Return
+    then the indices (t,) of these contact sets.
 
     An executable grasp is best. Next is a failed grasp whose contacts violate no constraint, then
     any other. In a tie the higher `score` decides.

@@ -131,7 +131,7 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
     """Return a mask of the k hand poses `obj_from_hand` [m] that the user's function `reachable`
     accepts.
 
-    Raises `BadArgument` for a malformed answer.
+    Raises `BadArgument` if it does not return k booleans.
     """
     if not len(obj_from_hand):
         return obj_from_hand.new_zeros(0, dtype=torch.bool)
@@ -155,8 +155,9 @@ class GraspCandidates(Batch):
     """Hand configurations to check, g in number, each with its contacts in the order of the
     fingers.
 
-    `certificate` is that of the contacts, and `status` the `Status` of contact planning. Finger i
-    touches contact `permutation[:, i]` of the planned contact set.
+    `certificate` is that of the contacts' force closure, and `status` the `Status` of contact
+    planning. `contacts` [m] and poses are in the object's frame. Finger i touches contact
+    `permutation[:, i]` of the planned contact set.
     """
 
     configuration: Annotated[Configuration, Rows("g")]
@@ -174,7 +175,7 @@ class GraspErrors(Batch):
 
     `tip_error` [m] is the distance of each of the f tips from its contact. `normal_angle` [rad] is
     the angle of the contact's inward normal from the pad's axis. `clearance` [m] is the least
-    clearance of the links.
+    clearance of the links from object, table, each other, and obstacles they must not touch.
     """
 
     tip_error: Annotated[Float[Tensor, "g f"], ANY]
@@ -197,7 +198,7 @@ def measure_errors(
     With `rolling`, round fingertips may roll on their contacts within the cones of their pads.
     Without `rolling`, as in the paper, each pad must touch with its own contact point, in any
     direction. `tolerance` [m] is the largest allowed distance of a tip from its contact. NaN is out
-    of tolerance.
+    of tolerance. Configurations, contacts [m] and `world` are in the object's frame.
     """
     spatial = SpatialJacobian.at(hand, configuration)
     touching = hand.tips.contact
@@ -253,8 +254,9 @@ def check_candidates(
     """Return a grasp for each candidate, with pre-grasp, approach and the `Status` of the first
     check that it fails.
 
-    With `rolling`, round fingertips may roll on their contacts (`measure_errors`). `tolerance` [m]
-    is the largest allowed distance of a tip from its contact.
+    With `rolling`, round fingertips may roll on their contacts within the cones of their pads.
+    Without, each pad must touch with its own contact point. `tolerance` [m] is the largest allowed
+    distance of a tip from its contact. `problem` holds the hand and its surroundings.
     """
     hand = problem.hand
     world = problem.world
@@ -349,9 +351,9 @@ def score(
     """Return the geometric score of each grasp, at most 0 and without unit; a higher score is
     better.
 
-    It is -(d / `CHECKS.offset` + mu + a / `CHECKS.pad_angle`). Here d is the distance of the
-    contacts' centroid from `center` [m], and a the largest `normal_angle` [rad] of a fingertip. The
-    number mu is the friction coefficient that forces towards the centroid need
+    It is -(d / 20 mm + mu + a / 0.8 rad) (`CHECKS.offset`, `CHECKS.pad_angle`). Here d is the
+    distance of the contacts' centroid from `center` [m], and a the largest `normal_angle` [rad] of
+    a fingertip. The number mu is the friction coefficient that forces towards the centroid need
     (`centred_friction`).
     """
     offset = norm(contacts.points.mean(1) - center)

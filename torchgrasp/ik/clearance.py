@@ -116,7 +116,7 @@ class Obstacles(Value):
 
 
 def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, "x y z"]:
-    """Return the distance [m] of each voxel from the border of a `region`: 0 inside it.
+    """Return the distance [m] of each voxel's centre from a `region` of voxels: 0 inside it.
 
     `spacing` [m] is the edge of a voxel. For an empty region the distance is larger than the grid.
     """
@@ -130,8 +130,8 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 @checked
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """What the links of a hand must not touch, in the frame of the object. None means that a part
-    does not exist.
+    """What the links of a hand must not touch, in the frame of the object. A part that is None does
+    not exist.
 
     Args:
         field: signed distances [m] from the object, negative inside. If all hands of a batch have
@@ -192,8 +192,10 @@ class CollisionWorld(Value):
 
 
 def is_world_fused(world: CollisionWorld | None, *tensors: Tensor) -> TypeGuard[CollisionWorld]:
-    """Return whether compiled loops can compute in a world: with one object, and a table without
-    edge.
+    """Return whether compiled loops can compute clearances of hands from a `world`.
+
+    They can with one object for all hands, a table without edge, and `tensors` in float64 on the
+    CPU. Without a world (None) they cannot.
     """
     if world is None or not is_fused(*tensors):
         return False
@@ -204,8 +206,9 @@ def is_world_fused(world: CollisionWorld | None, *tensors: Tensor) -> TypeGuard[
 def level(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b"]:
     """Return the clearances [m] of `points` [m] from a `table`, plus the table's offset.
 
-    Without an edge they are the coordinates along the table's normal. With one they are those of
-    `Plane.clearance`.
+    The offset is the plane's distance from the origin. So without an edge the results are the
+    coordinates along the table's normal. With an edge, a clearance is the height above the table or
+    the distance beyond the edge, whichever is greater.
     """
     height = points @ table.normal.to(points)
     if table.edge is None:
@@ -217,7 +220,8 @@ def away(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b 3"]:
     """Return the unit direction in which the clearance of each of `points` [m] from a `table`
     grows: its gradient.
 
-    It is the table's normal, or the edge's where that is farther.
+    It is the table's normal. Where a point is farther beyond the table's edge than above the table,
+    it is the edge's outward normal.
     """
     normal = table.normal.to(points).expand_as(points)
     if table.edge is None:
@@ -229,8 +233,9 @@ def away(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b 3"]:
 def table_clearance(
     centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"], table: Plane
 ) -> Float[Tensor, "*b"]:
-    """Return the least clearance [m] of s spheres from a `table`; `centres` and `radius` are in
-    metres.
+    """Return the least clearance [m] of s spheres from a `table`, negative if one is in the table.
+
+    `centres` [m] are in the table's frame, and `radius` [m] holds the spheres' radii.
     """
     return (level(centres, table) - radius).amin(-1) - table.offset
 
@@ -239,10 +244,11 @@ def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
     """Return the cost [mm2] of each hand: the sum of squares of the clearances that its spheres
-    lack.
+    lack to 4 mm (`CLEARANCE`).
 
-    Fingertips may touch the object. `centres` [m] are those of the hand's `spheres`, and `world`
-    holds what they must not touch.
+    The clearances are from object, obstacles and table, by the nearest grid nodes. Fingertips may
+    touch the object and the table. `centres` [m] are those of the hand's `spheres`, in the object's
+    frame.
     """
     radius = spheres.radius.to(centres)
     cost = centres.new_zeros(centres.shape[:-2])
@@ -261,12 +267,13 @@ def collision_cost(
 def clearance_rows(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[ResidualRows]:
-    """Return residuals (g, k) [mm]. They are by how much the k smallest clearances of each of g
-    hands are below the least wanted ones.
+    """Return residuals (g, k) [mm]: by how much the smallest clearances of g hands are below the
+    wanted ones.
 
-    The wanted ones are `SELF_CLEARANCE` between links, which come first, and `CLEARANCE` from
-    object, obstacles and table. A larger clearance gives 0. `spatial` are the kinematics of the
-    hands. With `tips_touch` the fingertips may touch the object and the table.
+    The wanted clearance is 1 mm (`SELF_CLEARANCE`) between links, which come first. It is 4 mm
+    (`CLEARANCE`) from object, obstacles and table. A larger clearance gives 0. The 8 (`HINGES`)
+    smallest clearances of each kind enter. `spatial` holds the kinematics of the hands. With
+    `tips_touch` the fingertips may touch the object and the table.
     """
     pairs = spatial.hand.self_collision
     moves = spatial.hand.motion.moves
@@ -284,8 +291,12 @@ def clearance_rows(
 def sphere_rows(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[ResidualRows]:
-    """Return the part of `clearance_rows` for the clearances of links from object, obstacles and
-    table; same arguments.
+    """Return residuals (g, k) [mm]: by how much clearances from object, obstacles and table are
+    below 4 mm (`CLEARANCE`).
+
+    A larger clearance gives 0. The 8 (`HINGES`) smallest clearances of each of g hands from each of
+    the three enter. `spatial` holds the kinematics of the hands. With `tips_touch` the fingertips
+    may touch the object and the table.
     """
     spheres = spatial.hand.collision_spheres
     motion = spatial.hand.motion
@@ -332,10 +343,11 @@ def sphere_rows(
 def link_clearance(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[Float[Tensor, "g"]]:
-    """Return three least clearances (g,) [m] of each hand.
+    """Return three least clearances (g,) [m] of each of g hands: of links from the object, of tips
+    from the object, of all links from the table.
 
-    They are of links and of tips from the object, and of all links from the table. The links leave
-    out the tips if `tips_touch`. They are infinite if the world has no object or no table.
+    With `tips_touch`, the first one leaves out the tips. Without an object the first two are
+    infinite, without a table the third. `spatial` holds the kinematics of the hands.
     """
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres

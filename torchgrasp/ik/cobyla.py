@@ -52,8 +52,9 @@ def refine_by_cobyla(
 ) -> Configuration:
     """Return hand configurations moved onto three contacts each by SciPy's COBYLA.
 
-    The joints in `start` are the initial ones; its poses are not used. `contacts` are one set for
-    each configuration, and the links keep clear of the `world`.
+    The joints in `start` are the initial ones; its poses are not used. `contacts` [m] are one set
+    for each configuration, with contact i for finger i. The links keep clear of the `world`, which
+    is in the frame of the contacts. Raises `DegenerateContacts` for contacts on a line.
     """
     if not len(start):
         return start
@@ -65,7 +66,7 @@ def refine_by_cobyla(
 
 
 class CobylaRun:
-    """One run of SciPy's COBYLA from initial `joints` [rad] onto three contact `points` [m].
+    """One run of SciPy's COBYLA from initial `joints` [rad or m] onto three contact `points` [m].
 
     The points are in the object's frame; `world` holds what the hand must not touch. l counts the
     hand's links. The values at the last evaluated point are cached.
@@ -90,11 +91,12 @@ class CobylaRun:
     def place(
         self, x: np.ndarray
     ) -> tuple[Tensor, Float[Tensor, "3 4 l 1"], Float[Tensor, "4 4"], bool]:
-        """Return joints [rad], link frames, hand pose [m] by Eq. (24), and whether the tips span a
-        frame.
+        """Return joints [rad or m], link frames, hand pose [m] by Eq. (24), and whether the tips
+        span a frame.
 
-        `x` are COBYLA's variables: the changes of the joints in units of `COBYLA.angle`. The link
-        frames (3 x 4) [m] are in the hand's frame.
+        `x` are COBYLA's variables: the changes of the joints in units of 0.01 rad (`COBYLA.angle`).
+        The link frames (3 x 4) [m] are in the hand's frame, and its pose is in the object's frame.
+        If the tips are on a line, they span no frame, and the pose is the identity.
         """
         hand = self.hand
         step = COBYLA.angle * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
@@ -106,17 +108,19 @@ class CobylaRun:
         return joints, frames, virtual_frame(self.points) @ inverse(virtual_frame(tips)), True
 
     def tips(self, frames: Float[Tensor, "3 4 l 1"]) -> Float[Tensor, "3 3"]:
-        """Return the contact points [m] of the fingertips in the hand's frame, given the link
-        `frames`.
+        """Return the contact points [m] of the three fingertips in the hand's frame.
+
+        `frames` (3 x 4) [m] are the poses of the links in this frame.
         """
         tips = self.hand.tips
         return map_points(frames.index_select(2, tips.index), tips.contact)[..., 0].T
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the sum of the distances [mm] of tips from contacts, then the constraints, which
-        must be >= 0.
+        """Return the sum of the distances [mm] of tips from contacts, then the constraints [mm],
+        which must be >= 0.
 
-        These are the clearances [mm] less 0.5 mm, at COBYLA's variables `x`.
+        The constraints are the clearances, at most 20 mm (`COBYLA.far`), less 0.5 mm. `x` are
+        COBYLA's variables: changes of the joints. The sum is 1000 if the tips are on a line.
         """
         key = np.asarray(x).tobytes()
         if self.last is None or self.last[0] != key:
@@ -132,10 +136,11 @@ class CobylaRun:
     ) -> list[Float[Tensor, ""]]:
         """Return least clearances [m] of the hand from itself and from the world.
 
-        First are those between the hand's own links. Then follow those from the object to the palm,
-        to each finger and to each fingertip. Last are those from the table and from obstacles to
-        the hand. Clearances for which the world has no part are left out. `frames` are the link
-        frames in the hand's frame, and `pose` [m] is the hand's in the object's frame.
+        First is that between the hand's own links. Then follow those from the object to the palm,
+        to each finger and to each fingertip. To those of the fingertips 2 mm (`TIP_PENETRATION`)
+        are added, since tips may press into the object. Last are those from the table and from
+        obstacles to the hand. Clearances for which the world has no part are left out. `frames` are
+        the link frames in the hand's frame, and `pose` [m] is the hand's in the object's frame.
         """
         world = self.world
         spheres = self.hand.collision_spheres

@@ -29,8 +29,10 @@ from torchgrasp.hand.kinematics import map_points
 @checked
 @dataclasses.dataclass(frozen=True)
 class Configuration(Batch):
-    """Configurations of a free-floating hand: actuated `joints` [rad] and `obj_from_hand`, its pose
-    in the object's frame [m].
+    """Configurations of a free-floating hand: actuated `joints` [rad or m] and `obj_from_hand`, its
+    pose (g, 4, 4) [m] in the object's frame.
+
+    g counts configurations, and h actuated joints.
     """
 
     joints: Float[Tensor, "g h"]
@@ -61,12 +63,13 @@ class Configuration(Batch):
 
 class ResidualRows(NamedTuple):
     """k residuals of g configurations, with the factors of their derivatives with respect to q
-    motions.
+    motions of the hand.
 
-    `residual` is a weighted length [mm], or a weighted error of a cosine. `wrench` holds its
-    derivatives with respect to a translation [m] and a rotation [rad] about the object's origin.
-    The derivative with respect to a motion is `wrench` times the twist of the motion where `moves`
-    is 1. It is 0 where `moves` is 0.
+    The q motions are three translations, three rotations, and those of the moved joints. `residual`
+    is a weighted length [mm], or a weighted error of a cosine. `wrench` holds its derivatives with
+    respect to a translation [m] and a rotation [rad] about the object's origin. The derivative with
+    respect to a motion is `wrench` times the twist of the motion where `moves` is 1. It is 0 where
+    `moves` is 0.
     """
 
     residual: Float[Tensor, "g k"]
@@ -81,8 +84,9 @@ class SpatialJacobian(Value):
 
     `obj_from_link` are the poses (3 x 4) [m] of the l links. `spheres` [m] are the centres of the s
     collision spheres, and `tips` [m] those of the f fingertips. `pads` are the unit normals of
-    their pads. `twists` are those of the q motions: the velocity at the object's origin, then the
-    rotation.
+    their pads. `twists` are those of the q motions of the hand: the velocity at the object's
+    origin, then the rotation. Letters in shapes: g configurations, q motions (three translations,
+    three rotations, and the moved joints), h actuated joints, d = 6 + h.
     """
 
     hand: Hand
@@ -94,7 +98,7 @@ class SpatialJacobian(Value):
 
     @classmethod
     def at(cls, hand: Hand, configuration: Configuration) -> "SpatialJacobian":
-        """Return the kinematics of a hand at g configurations."""
+        """Return the kinematics of a hand at g configurations, in the object's frame."""
         root = configuration.obj_from_hand[:, :3].permute(1, 2, 0)
         frames = hand.tree.frames(hand.actuated.couple(configuration.joints).T.contiguous(), root)
         spheres, tips, pads, origins, turning, sliding = hand.motion.place(frames)

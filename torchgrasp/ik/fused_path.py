@@ -54,11 +54,13 @@ def sweep(
     step: float,
     nodes: float,
 ) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] of hands at `steps` positions on their paths, each `step` [m]
-    back from the one before.
+    """Return the least clearance [m] of g hands from the `world` on their straight approaches.
 
-    It is exact with `nodes`, the error in grid spacings of a clearance at the nearest node. With 0
-    it is that at the nearest nodes.
+    A hand is checked at `steps` positions, each `step` [m] farther back against its unit
+    `direction`. `centres` [m] are those of its s collision spheres at the end of the approach, and
+    `radius` [m] their radii. Distances from grids are first taken at the nearest node. `nodes` is
+    their largest error in grid spacings; spheres that may be nearest are then interpolated. With 0
+    there is no interpolation.
     """
     parts = world_parts(radius, torch.zeros_like(radius, dtype=torch.bool), world)
     least = torch.empty_like(centres[:, 0, 0])

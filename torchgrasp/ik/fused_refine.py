@@ -407,7 +407,21 @@ def solve(
     steps: int = 0,
     fixed: bool = False,
 ) -> tuple[Configuration, Tensor, Tensor]:
-    """Return configurations after at most `steps` steps, and their residuals and Jacobian."""
+    """Return configurations after at most `steps` Levenberg-Marquardt steps. Return then their
+    weighted residuals (g, k) and Jacobian (g, k, 6 + h).
+
+    Args:
+        hand: the hand, with h actuated joints.
+        configuration: the g configurations at the start.
+        target: wanted fingertip centres [m] in the object's frame.
+        normals: outward unit normals at the contacts.
+        world: what the links must keep clear of.
+        tips_touch: whether fingertips may touch the object and the table.
+        weights: weights of the errors of tip positions and of pad directions.
+        problem: the parameters of the solver; None means those of `LeastSquares`.
+        steps: most steps; 0 only evaluates.
+        fixed: whether the hand's pose stays as it is.
+    """
     tables = hand.derived.get(HandTables) or hand.derived.setdefault(HandTables, _tables(hand))
     spheres = hand.collision_spheres
     parts = world_parts(spheres.radius, spheres.touching & tips_touch, world)

@@ -116,7 +116,23 @@ def rank_pairs(
     candidates: int,
     count: int,
 ) -> Int[Tensor, "r count"]:
-    """Return the pairs of least cost, as `_rank_pairs` of `seeds`, with `centres` [m] of spheres."""
+    """Return for each of r contact sets the `count` pairs of least cost, best first.
+
+    A pair is an assignment of contacts to fingers and a posture: a s + k is that of assignment a
+    and posture k. Only the `candidates` pairs of the least `energy` are placed. The cost [mm2] is
+    `weight` times the energy, plus the `collision_cost` of the placed hand.
+
+    Args:
+        energy: half the squared distance of features, without unit, of each of the p pairs.
+        obj_from_vf: virtual frame [m] of the contacts in each assignment.
+        vf_from_hand: pose [m] of the hand in the virtual frame of each of s postures.
+        centres: centres [m] of the k collision spheres in the hand's frame.
+        spheres: the collision spheres of the hand.
+        world: what the hand must keep clear of, in the object's frame.
+        weight: cost [mm2] of an energy of 1.
+        candidates: number of pairs of each contact set whose cost is computed.
+        count: number of pairs that are returned.
+    """
     pairs = torch.empty(len(energy), count, dtype=torch.int64)
     _rank(
         array(energy, torch.float32),

@@ -19,34 +19,45 @@ from torchgrasp.ik.clearance import CLEARANCE, CollisionWorld
 
 
 class WorldPart(NamedTuple):
-    """A grid of distances, or a plane, or nothing, as `kind` 2, 1 and 0 says. The numbers `grown`
-    are added to the distance of each sphere's centre to give its clearance.
+    """A part of a hand's surroundings: a grid of distances [m] (`kind` 2), a plane (1), or nothing
+    (0).
+
+    The numbers `grown` (s,) [m] are added to the distance of each sphere's centre to give its
+    clearance.
     """
 
     kind: int
-    values: np.ndarray
-    origin: np.ndarray  # of a plane its normal
-    shape: np.ndarray
-    spacing: float  # of a plane its offset
+    values: np.ndarray  # distances [m] at the grid's nodes, in one row; empty for a plane
+    origin: np.ndarray  # first node [m] of the grid; of a plane its unit normal
+    shape: np.ndarray  # numbers of nodes along the three axes
+    spacing: float  # distance [m] of neighbouring nodes; of a plane its offset from the origin
     grown: np.ndarray
 
 
 @inlined
 def turn(frame, v):
-    """Return a direction in the frame in which the columns of a pose, the rows of `frame`, are."""
+    """Return the vector `v` of a frame b in frame a: the rotation of the pose a_from_b.
+
+    The rows of `frame` are the columns of this pose: three axes, then the origin.
+    """
     turned = scale(frame[0], v[0])
     return add(add(turned, frame[1], v[1]), frame[2], v[2])
 
 
 @inlined
 def place(frame, v):
-    """Return a point in that frame."""
+    """Return the point `v` [m] of a frame b in frame a: the rotation and translation of a_from_b.
+
+    The rows of `frame` are the columns of this pose: three axes, then the origin [m].
+    """
     return add(turn(frame, v), frame[3], 1.0)
 
 
 @inlined
 def coarse_clearance(part, p):
-    """Return the height over a plane, or the distance at the nearest node of a grid."""
+    """Return the height [m] of a point `p` [m] over a plane; of a grid, the distance [m] at the
+    nearest node.
+    """
     if part.kind == 1:
         return dot(p, part.origin) - part.spacing
     number = 0
@@ -59,8 +70,10 @@ def coarse_clearance(part, p):
 def world_parts(
     radius: Float[Tensor, "s"], touching: Bool[Tensor, "s"], world: CollisionWorld
 ) -> tuple[WorldPart, ...]:
-    """Return object, obstacles and table of a world, in this order. The spheres in the mask
-    `touching` may touch object and table.
+    """Return object, obstacles and table of a world, in this order; what does not exist has kind 0.
+
+    `radius` [m] holds the radii of s collision spheres. The spheres in the mask `touching` may
+    touch object and table.
     """
     none = np.zeros(0)
     size = np.zeros(3, np.int64)

@@ -71,7 +71,7 @@ class SlidingNumbers:
     """Parameters of the optimisation of hand posture and contacts together."""
 
     seeds: int = 2
-    """Number of tried initial guesses of a contact set: of more, few find another grasp."""
+    """Number of tried initial guesses of a contact set: more guesses find few other grasps."""
     rows: int = 512
     """Number of initial guesses that are optimised at a time on a CPU."""
     most_rows: int = 2**15
@@ -138,7 +138,7 @@ class JointProblem:
     world: CollisionWorld
 
     def rows(self, index: Int[Tensor, "k"]) -> "JointProblem":
-        """Return the problems of the grasps with the indices `index`."""
+        """Return the problems of the k grasps with the indices `index` in the batch."""
         shape = rows_of(self.shape, index)
         contact_problem = self.contact_problem.rows(index)
         return JointProblem(self.hand, shape, contact_problem, self.world.rows(index))
@@ -146,8 +146,9 @@ class JointProblem:
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
         """Return all weighted residuals (g, k) of a `state`, then their Jacobian (g, k, d).
 
-        They are the residuals of the hand (`grasp_residuals`), then those of the contacts, times
-        `CONTACT_WEIGHT` and the shape's scale [mm]. The Jacobian is by hand pose (6), joints,
+        First are the residuals of the hand (`grasp_residuals`): lengths [mm] and weighted cosines.
+        Then follow those of the contacts, times 2 (`CONTACT_WEIGHT`) and the shape's scale [mm]. In
+        the shape k counts residuals, and d unknowns. The Jacobian is by hand pose (6), joints,
         contacts and tensions. `flat` is the constraint that contacts are on flat surface; None
         leaves it out.
         """
@@ -224,12 +225,12 @@ class JointProblem:
     def solve(
         self, configuration: Configuration, points: Float[Tensor, "g f 3"]
     ) -> tuple[Configuration, Float[Tensor, "k f 3"], Int[Tensor, "k"]]:
-        """Return the hands, then the normalised contacts (k, f, 3), of the k grasps of low cost.
-        Return also their indices (k,) among the g grasps at the start.
+        """Return the hands, then the normalised contacts (k, f, 3), of the k grasps that are not
+        given up. Return also their indices (k,) among the g grasps at the start.
 
         `configuration` holds the g hands at the start, and `points` their normalised contacts. The
-        least-squares problem is solved in stages (`STAGES`). After each stage, grasps whose cost
-        [mm2] is not below the stage's `hopeless` are given up.
+        least-squares problem is solved in three stages (`STAGES`). After them, grasps whose cost is
+        not below 1e5, 1e4 and 500 mm2 are given up (`SlidingStage.hopeless`).
         """
         own = self
         largest = self.contact_problem.spec.flatness
@@ -266,7 +267,8 @@ def solve_sliding(
 ) -> None:
     """Optimise hand and contacts together for each unsolved contact set of `attempts`.
 
-    The checked grasps are added to `attempts`, except those that `JointProblem.solve` gives up.
+    The checked grasps are added to `attempts`. Grasps whose cost stays high are left out
+    (`JointProblem.solve`).
 
     Args:
         joint_problem: the least-squares problem of hand and contacts, for each contact set.

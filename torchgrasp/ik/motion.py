@@ -67,7 +67,7 @@ def find_approach(
 
     Candidate directions are tried by falling approximate clearance. The first direction without a
     collision is chosen; if there is none, the direction of the largest clearance. Directions are in
-    the object's frame.
+    the object's frame, along the motion of the hand. The path is 0.1 m long (`APPROACH_DISTANCE`).
     """
     spheres = hand.collision_spheres
     centres = _centres(hand, opened)
@@ -131,8 +131,10 @@ def opened_pose(
 def approach_directions(
     hand: Hand, opened: Configuration, table: Plane | None
 ) -> Float[Tensor, "g k 3"]:
-    """Return k unit candidate directions in the object's frame: the hand's axis, tilted axes, down
-    onto a table.
+    """Return k unit candidate directions of each hand's approach, in the object's frame.
+
+    They are the hand's approach axis, 8 directions at 45 degrees to it, and down onto the `table`.
+    None means no table, and leaves out the last one.
     """
     pose = opened.obj_from_hand
     axis = unit(hand.approach.to(pose))
@@ -201,8 +203,8 @@ def motion_clearance(
     """Return the least clearance [m] of each hand from obstacles while the hand closes and is
     lifted.
 
-    The `world` must have obstacles. `closed` and `opened` are the configurations of the grasp and
-    of the opened hand.
+    The lift is along the table's normal, or along z without a table. The `world` must have
+    obstacles. `closed` and `opened` are the configurations of the grasp and of the opened hand.
     """
     assert world.obstacles is not None
     up = UP if world.plane is None else world.plane.normal
@@ -237,8 +239,8 @@ def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> floa
     """Return the least clearance [m] of the lifted object from obstacles; far below 0 if an
     obstacle is on it.
 
-    `vertices` [m] are those of the object, which is lifted along z; without any, the clearance is
-    infinite.
+    `vertices` [m] are those of the object, in the frame of the obstacles. It is lifted along z by
+    0.1 m (`MOTION.lift`). Without vertices the clearance is infinite.
     """
     if not len(vertices):
         return math.inf

@@ -47,7 +47,7 @@ class PressNumbers:
     weakest: float = 5.0
     """Least normal force [N] of a pressing finger: a quarter of a kilogram slides with it."""
     strongest: float = 60.0
-    """Greatest one: a stretched finger does not give way, and its force is hard to control."""
+    """Greatest normal force [N]: a stretched finger does not give way, and is hard to control."""
     compliance: float = 1e-5
     """Compliance [m/N] of gears and links, which every fingertip has in all directions."""
     kept: int = 200
@@ -62,7 +62,8 @@ PRESS = PressNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class PressPostures(Batch):
-    """Pressing postures of a hand: first those of two tips, each kind by falling gap.
+    """Pressing postures of a hand: first those with two pressing tips, then those with one. Each
+    kind is sorted by falling gap.
 
     The gap is the distance by which all other links are higher than the pressing tips.
 
@@ -103,7 +104,7 @@ def press_postures(hand: Hand, seed: Seed = 0) -> PressPostures:
     At most 200 (`PRESS.kept`) are returned, and none if no posture presses. They are in float64 on
     the CPU. The result is cached in `hand.derived`.
 
-    Raises the errors of `sample_configurations`.
+    Raises `BadArgument` if almost all random postures of the hand collide with themselves.
 
     >>> from torchgrasp import load_hand
     >>> found = press_postures(load_hand("allegro"))

@@ -42,7 +42,7 @@ class OpeningNumbers:
     gap: float = 0.012
     """Distance [m] that each tip moves off its contact on a certain surface."""
     deviations: float = 3.0
-    """Standard deviations of the surface by which it moves farther."""
+    """Number of the surface's standard deviations by which a tip moves farther."""
     solved: float = 1.0
     """Sum of squared residuals [mm2] of an opened hand: half a millimetre at a tip."""
     steps: int = 12
@@ -53,8 +53,10 @@ OPENING = OpeningNumbers()
 
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
-    """Return the positions [m] of the fingertip centres when the tips touch: one radius from the
-    contacts, outward.
+    """Return the positions [m] of the fingertip centres when the tips touch.
+
+    They are one tip radius from the contacts, along the outward normals. Finger i touches contact
+    i. Contacts and results are in the object's frame.
     """
     return contacts.points + hand.tips.radius.to(contacts.normals)[:, None] * contacts.normals
 
@@ -64,8 +66,8 @@ def tip_rows(
 ) -> ResidualRows:
     """Return 4 f residuals of fingertips: position errors, then errors of contact directions.
 
-    A position error has three components [mm], times `TIP_WEIGHT`. A contact direction has one
-    residual, times `PAD_WEIGHT`. It is the cosine of the pad's cone less the cosine of the
+    A position error has three components [mm], times 2 (`TIP_WEIGHT`). A contact direction has one
+    residual, times 80 (`PAD_WEIGHT`). It is the cosine of the pad's cone less the cosine of the
     direction's angle from the pad's axis. Inside the cone it is 0. `target` [m] holds the wanted
     centres of the tips. `normals` are the outward unit normals at their contacts, both in the
     object's frame.
@@ -130,7 +132,8 @@ def refine(
     links are clear.
 
     The solver may not succeed, so check the result. A configuration is done when the sum of its
-    squared `grasp_residuals` [mm2] is below `solved`, or after `steps` steps.
+    squared `grasp_residuals` [mm2] is below `solved`, or after `steps` steps. A `world` of None
+    leaves out all clearances, also those between links.
     """
     target = tip_targets(hand, contacts)
     normals = contacts.normals
@@ -151,11 +154,12 @@ def refine(
 def open_hand(
     hand: Hand, grasp: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Float[Tensor, "g h"]:
-    """Return the joints [rad] of the opened hand: each tip is moved off its contact along the
+    """Return the joints [rad or m] of the opened hand: each tip is moved off its contact along the
     normal.
 
-    The links keep clear of the `world`, and the hand's pose stays that of the `grasp`. Raises
-    `BadArgument` if the contacts lack `std_m`.
+    The tip moves by 12 mm, and by 3 standard deviations of the surface (`OPENING`). The links keep
+    clear of the `world`, and the hand's pose stays that of the `grasp`. Raises `BadArgument` if the
+    contacts lack the standard deviations `std_m`.
     """
     normals = contacts.normals
     gap = OPENING.gap + OPENING.deviations * contacts.require_std()

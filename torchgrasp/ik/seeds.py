@@ -56,7 +56,7 @@ class SeedNumbers:
     candidates: int = 64
     """Number of nearest postures of a contact set that are checked for clearance."""
     assignments: int = 6
-    """Number of assignments in which a contact set is compared with the whole library."""
+    """Number of assignments of contacts to fingers that are compared with the whole library."""
     compared: int = 500
     """Number of postures of the library by which these assignments are chosen."""
     spare: int = 3
@@ -140,7 +140,7 @@ class PostureLibrary(Value):
                 (`SEEDS.many_postures`) for more than three fingers.
             seed: seed of the draws.
 
-        Raises the errors of `sample_configurations`.
+        Raises `BadArgument` for a hand of which almost no random posture is kept.
         """
         if count is None:
             count = SEEDS.postures if len(hand.tips) == 3 else SEEDS.many_postures
@@ -173,8 +173,8 @@ class PostureLibrary(Value):
 
 
 def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return a triangle for three to five points [m]: the first, the centroid of the middle ones,
-    and the last.
+    """Return a triangle (*b, 3, 3) [m] for f = 3 to 5 points [m]: the first, the centroid of the
+    middle ones, and the last.
     """
     if points.shape[-2] == 3:
         return points
@@ -183,10 +183,11 @@ def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the frame [m] of three to five points, with the origin at their centroid.
+    """Return the pose (*b, 4, 4) [m] of the virtual frame of 3 to 5 points [m].
 
-    Its axes are those of the `virtual_frame` of three points. They are the given ones, or for more
-    than three points the corners of the triangle that `triangle_of` returns.
+    It is in the frame of the points. Its origin is the centroid of the points. The x axis points
+    from the first to the last point. The z axis is normal to the plane through these two and the
+    centroid of the others.
     """
     return rigid(virtual_frame(triangle_of(points))[..., :3, :3], points.mean(-2))
 
@@ -194,10 +195,11 @@ def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
 def feature(
     centres: Float[Tensor, "*b f 3"], pads: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b d"]:
-    """Return the feature vector (d = 6 f) of a posture: tip centres and pad axes, each divided by
-    its scale.
+    """Return the feature vector (d = 6 f numbers without unit) of a posture with f fingertips.
 
-    `centres` [m] and the unit vectors `pads` are in the frame of `tips_frame`.
+    Each tip has its centre divided by 10 mm (`SEEDS.length_scale`), then the axis of its pad
+    divided by 0.5 (`SEEDS.cosine_scale`). `centres` [m] and the unit vectors `pads` are in the
+    virtual frame of the tips (`tips_frame`).
     """
     scaled = torch.cat([centres / SEEDS.length_scale, pads / SEEDS.cosine_scale], -1)
     return scaled.flatten(-2).float()

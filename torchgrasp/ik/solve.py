@@ -205,8 +205,9 @@ def refine_exactly(
 ) -> Configuration:
     """Return hand configurations moved from `start` onto their contacts, clear of the `world`.
 
-    Each is refined with a margin of clearance, then anew without regard to clearance. The second
-    result counts where it passes all checks (`measure_errors`), else the first.
+    Finger i touches contact i. Each is refined with a margin of clearance, then from there without
+    regard to clearance. The second result counts where it passes all checks (`measure_errors`),
+    else the first.
     """
     refined = refine(hand, start, contacts, world, SOLVING.solved)
     settled = refine(hand, refined, contacts, None, SOLVING.solved)

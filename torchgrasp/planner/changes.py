@@ -56,7 +56,7 @@ class Change:
         words: description of the change.
         choice: whether the user can make the change; otherwise it is a change of the world, such as
             a higher friction.
-        cures: the failures that the change could prevent.
+        cures: the statuses of failed grasps or contact sets that the change could prevent.
         request: the request with the change.
         refit: whether the object's shape must be estimated anew.
     """
@@ -186,7 +186,9 @@ def _friction(request: Request) -> Iterator[Change]:
 
 
 def near_target(scene: Scene) -> list[int]:
-    """Return the labels of the objects within a finger's reach of the target, the nearest first."""
+    """Return the labels of the objects within 0.15 m (`CHANGES.beside`) of the scene's target, the
+    nearest first.
+    """
     some = dict[int, torch.Tensor]()
     for label in scene.things:
         part = scene.points[scene.labels == label]

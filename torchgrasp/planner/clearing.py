@@ -29,15 +29,15 @@ CLEARING = ClearingNumbers()
 def order_to_clear(scene: Scene, plan: Callable[..., Grasps], starts: int) -> tuple[int, ...]:
     """Return labels of the objects to take away, in order, until the target has a grasp.
 
-    Each time, the object goes without which the target has the most executable grasps. If it has
-    none, the nearest goes. The result is empty if no object is near, or if too many would have to
-    go.
+    In each step the four objects nearest to the target are compared. The one is taken away without
+    which the target has the most executable grasps, else the nearest. The result is empty if no
+    object is within 0.15 m, or if taking away three objects does not suffice.
 
     Args:
         scene: the scene, with its target.
-        plan: function that plans the target of a scene, with the number of initial guesses as
-            `starts`.
-        starts: number of initial guesses; `CLEARING.starts` if it is greater.
+        plan: function of a scene and the keyword `starts`, a number of initial guesses. It returns
+            the grasps of the scene's target.
+        starts: number of initial guesses; at most 60 (`CLEARING.starts`) are used.
     """
     plan = functools.partial(plan, starts=min(starts, CLEARING.starts))
     order = list[int]()
@@ -57,7 +57,10 @@ def order_to_clear(scene: Scene, plan: Callable[..., Grasps], starts: int) -> tu
 
 
 def count_grasps(plan: Callable[..., Grasps], scene: Scene) -> int:
-    """Return the number of executable grasps of a scene's target; 0 if it cannot be planned."""
+    """Return the number of executable grasps that the function `plan` finds for a scene's target.
+
+    The number is 0 if `plan` raises a `GraspError`.
+    """
     try:
         return int((plan(scene).status == Status.OK).sum())
     except GraspError:

@@ -34,9 +34,11 @@ class DragNumbers:
     """Parameters of a drag to the edge."""
 
     behind: float = 0.015
-    """Least distance [m] behind the edge at which the centre of mass ends, or"""
+    """Least distance [m] behind the edge at which the centre of mass ends."""
     unsure: float = 0.25
-    """this share of the object's reach from its centre to the edge: so far off are estimates."""
+    """The same as a share of the object's extent from its centre towards the edge: so far off are
+    estimates. The greater distance counts.
+    """
     farthest: float = 2.0
     """Largest distance [m] of the edge from the points of the view: a larger one is in another unit."""
     supported: float = 0.004
@@ -144,10 +146,10 @@ def find_drag(
     friction: float,
     table_friction: float,
 ) -> DragPlan | str:
-    """Return the best drag of an object to its table's edge, or the reason why there is none.
+    """Return the best drag of an object to its table's edge; without one, text with the reason.
 
     Args:
-        object_: the object on its table.
+        object_: the object on its table, with its estimated shape.
         hand: the hand.
         table: the table, with an edge, in the frame of the cloud; in float64 on the CPU.
         mass: mass [kg] of the object.
@@ -215,11 +217,13 @@ def _ways(table: Plane, length: float) -> list[Float[Tensor, "3"]]:
 class EdgeBalance:
     """Where the weight of an object acts, and how far the object may go over the table's edge.
 
+    The object's upright frame has a z axis that points up.
+
     Attributes:
         centre: estimated centre of mass (3,) [m] in the upright frame.
-        edge: unit vector (3,) towards the edge in the upright frame.
+        edge: horizontal unit vector (3,) towards the edge in the upright frame.
         away: distance [m] of the centre from the edge; negative if it is beyond the edge.
-        behind: distance [m] behind the edge at which the centre shall end.
+        behind: distance [m] from the edge, over the table, at which the centre shall end.
     """
 
     centre: Float[Tensor, "3"]
@@ -229,7 +233,7 @@ class EdgeBalance:
 
     @classmethod
     def of(cls, object_: ShapedObject, table: Plane) -> "EdgeBalance":
-        """Return the balance of an object on a table with an edge, in the frame of the cloud."""
+        """Return the balance of an object; `table` has an edge, in the frame of the cloud."""
         assert table.edge is not None
         centre = centre_of_mass(object_)
         edge = inverse(object_.obj_from_upright)[:3, :3] @ table.edge.normal
@@ -240,7 +244,9 @@ class EdgeBalance:
 
     @property
     def length(self) -> float:
-        """How far [m] towards the edge the object must be dragged; negative if it is there."""
+        """How far [m] the object must be dragged towards the edge; negative if its centre of mass
+        is already nearer to the edge than it should be.
+        """
         return self.away - self.behind
 
 
@@ -248,8 +254,10 @@ def pressing_force(mass: float, friction: float, table_friction: float) -> float
     """Return the pressing force [N] that drags an object of a `mass` [kg] (Coulomb's law); None if
     the object is too heavy.
 
-    A force N moves it if m N >= t (N + W). Here m and t are the frictions of fingers and table, and
-    W is the weight.
+    A normal force N moves the object if m N >= t (N + W). Here m is the coefficient `friction` of
+    the fingers, t that of the table, and W the weight. The result is three times the least N, or
+    twice the weight if that is more. It is from 1 to 20 N. An object is too heavy if 1.5 times the
+    least N exceeds 20 N.
     """
     weight = mass * GRAVITY
     least = table_friction * weight / (friction - table_friction)
@@ -261,8 +269,8 @@ def pressing_force(mass: float, friction: float, table_friction: float) -> float
 def centre_of_mass(object_: ShapedObject) -> Float[Tensor, "3"]:
     """Return the centroid [m] of the volume within the estimated surface, in the upright frame.
 
-    Each triangle and the mean vertex span a tetrahedron. The centroid is the mean of theirs, with
-    their signed volumes as weights.
+    Each triangle and the mean vertex span a tetrahedron. The centroid is the mean of the
+    tetrahedra's centroids, with their signed volumes as weights.
     """
     vertices = _vertices(object_)
     middle = vertices.mean(0)

@@ -24,11 +24,12 @@ KEY = "drag"
 
 @checked
 def with_drag(grasps: Grasps, drag: DragPlan) -> Grasps:
-    """Return grasps that keep the drag before them in `meta["drag"]`, also in the file of `save`.
+    """Return the grasps with a `drag` that comes before them, as JSON text in `meta["drag"]`.
 
-    It is JSON, in the frame of the cloud. Its names have the units, and `joints_rad` and `feet_m`
-    are by the names of joints and pressing fingers. `drag_of` returns the drag. Raises
-    `BadArgument` for a drag of another hand than that of the grasps.
+    `Grasps.save` writes the text too, and `drag_of` reads the drag from it. It is in the frame of
+    the cloud. Its keys end with the units. `joints_rad` maps names of joints to positions, and
+    `feet_m` names of pressing fingers to points. Raises `BadArgument` for a drag of another hand
+    than that of the grasps.
 
     >>> from torchgrasp import ContactSpec, Plane, load_object, plan_edge_grasps
     >>> x = torch.tensor([1.0, 0, 0])
@@ -61,7 +62,7 @@ def with_drag(grasps: Grasps, drag: DragPlan) -> Grasps:
 
 @checked
 def drag_of(grasps: Grasps) -> DragPlan | None:
-    """Return how the hand drags the object to the table's edge, before it grasps it there.
+    """Return how the hand drags the object to the table's edge before it grasps the object there.
 
     The result is the `DragPlan` that `plan_edge_grasps` and `torchgrasp grasp --edge` store in
     `Grasps.meta`. It is None if the grasps need no drag. Its tensors are in float64. Raises

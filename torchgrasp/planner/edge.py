@@ -154,10 +154,10 @@ def _table_with_edge(spec: ContactSpec) -> Plane:
 
 
 def check_edge(table: Plane, points: Points, name: str) -> None:
-    """Raise `BadArgument` if a table's edge is far beyond all points (n, 3) [m] of a view. Its
-    numbers are then not metres.
+    """Raise `BadArgument` if a table's edge is more than 2 m (`DRAG.farthest`) beyond all points of
+    a view: it is then not in metres.
 
-    Errors call the table by `name`.
+    `points` (n, 3) [m] and `table` are in one frame. `name` is the argument's name in the error.
     """
     assert table.edge is not None
     away = -float(table.edge.to("cpu", torch.float64).height(points.cpu().double()).max())

@@ -33,18 +33,18 @@ from torchgrasp.values.specs import ContactSpec, Mode, Ranking
 
 @dataclasses.dataclass(frozen=True)
 class ExplainNumbers:
-    """Bounds on the work of explaining why a plan has no grasp, and weights of tried changes."""
+    """Bounds on the work of explaining why a plan has no grasp, and weights of changes to try."""
 
     trials: int = 8
     """Largest number of changes that are tried."""
     starts: int = 20
-    """Initial guesses with which a change is tried: one change takes about a second."""
+    """Number of initial guesses with which a change is tried: one takes about a second."""
     more: int = 4
     """Ratio by which more initial guesses are tried; only requests of few guesses are tried so."""
     postures: int = 500
     """Size of the posture library; more take seconds for a hand that often meets itself."""
     judged: int = 5
-    """A plan of n initial guesses is judged by its n / `judged` best grasps."""
+    """A plan of n initial guesses is judged by its best n / `judged` grasps."""
     enough: float = 0.8
     """Expected success at which a change is good enough to end the search."""
     beside: float = 0.2
@@ -79,7 +79,7 @@ class Losses(Value):
 
     @property
     def reasons(self) -> str:
-        """The reasons with their counts, as one line of text."""
+        """The reasons of the losses with their counts, as one line of text."""
         return ", ".join(f"{n} {status.name.lower()}" for status, n in self.lost.items())
 
     def __str__(self) -> str:
@@ -139,8 +139,8 @@ class Funnel(Value):
 
     @checked
     def share(self, reasons: frozenset[Status]) -> float:
-        """Return the share of each stage's input that was lost for the given reasons, summed over
-        the stages.
+        """Return the sum over the stages of the share of the stage's input that was lost for the
+        given `reasons`.
         """
         shares = (
             n / stage.given
@@ -393,12 +393,12 @@ def _try_change(change: Change, known: Objects | None, tell: Observer) -> Trial:
 
 
 def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
-    """Return the changes that could prevent the most losses, the most helpful first; the others are
-    left out.
+    """Return the changes that could prevent the most losses, the most helpful first.
 
-    A change counts fully for the failures that it prevents. It counts one fifth for other failures
-    of the same stage. The reason is that a failed contact set reports only one of its failures.
-    `funnel` holds the losses without a change.
+    Changes whose weight is less than a quarter (`EXPLAIN.least`) of the greatest are left out. In
+    the weight, a change counts fully for the failures that it prevents. It counts one fifth for
+    other failures of the same stage. The reason is that a failed contact set reports only one of
+    its failures. `funnel` holds the losses without a change.
     """
     contacts = frozenset(status for status in Status if status < Status.OUT_OF_REACH)
     weight = dict[int, float]()
@@ -422,16 +422,18 @@ def try_request(
 ) -> tuple[Funnel, float, Objects]:
     """Return losses, expected success and object of a plan with a small library of postures.
 
-    The expected success is the mean, in [0, 1], of the best grasps (`expected_success`), one for
-    every `EXPLAIN.judged` initial guesses. Several sets of fingers share the initial guesses; the
-    results are those of the best set. If no contact set is found, the most relaxed constraints are
-    tried, too. The object is returned as `pose` made it for the last set of fingers.
+    The expected success, in [0, 1], is the mean predicted success of the best grasps. They are one
+    for every 5 initial guesses (`EXPLAIN.judged`). Several sets of fingers share the initial
+    guesses; losses and success are those of the best set. If no contact set is found, the most
+    relaxed constraints are tried, too. The returned object is prepared for the last set of fingers
+    (`pose`).
 
     Args:
         request: the arguments of the plan.
         known: the object of an earlier plan, whose shape and model are used again; None estimates
             the shape.
-        first: observer that is called with "funnel" and the losses of the first plan.
+        first: function that is called with "funnel", a line of text and the losses of the first
+            plan. None means no call.
     """
     told = dict[str, Any]()
     hands = request.hands

@@ -90,8 +90,9 @@ def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> d
     """Return the first reason why the hand cannot grasp each object of a scene, or `Status.OK`, by
     the object's label.
 
-    The objects are judged from the depth image alone, without planning, in milliseconds. `spec`
-    holds the constraints on contacts, by default `ContactSpec()`.
+    The objects are judged from the depth image alone, without planning, in milliseconds. Reasons
+    are `FEW_PIXELS`, `OFF_TABLE`, `CUT_OFF`, `NO_DEPTH`, `TOO_LOW` and `TOO_WIDE`. `spec` holds the
+    constraints on contacts; None means `ContactSpec()`.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> set(judge_things(load_scene(), load_hand("barrett")).values()) == {Status.OK}
@@ -188,7 +189,8 @@ def hand_span(hand: Hand) -> float:
     """Return the span [m] of a hand: the largest distance of two fingertip pads that face each
     other.
 
-    It is found among random postures, the same in every call.
+    Pads face each other if the line between them lies in the cones of both. The span is found among
+    random postures, the same in every call.
     """
     if "span" not in hand.derived:
         generator = torch.Generator().manual_seed(0)

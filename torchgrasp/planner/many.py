@@ -42,10 +42,11 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
     """Return the planned grasps of each cloud, on the cloud's device; a bad cloud does not affect
     the others.
 
-    `workers` is the number of processes, 0 for none. `given` holds the other arguments of
-    `Request`, common to all clouds. A worker process gives up a cloud after an hour. Where an
-    accelerator plans clouds at once, the worker processes estimate the shapes. Raises `BadArgument`
-    for arguments that only one cloud can have.
+    A bad cloud has no grasps, and `meta["refused"]` says why. `workers` is the number of processes,
+    0 for none. `given` holds the other arguments of `Request`, common to all clouds. A worker
+    process gives up a cloud after an hour. Where an accelerator plans clouds at once, the worker
+    processes estimate the shapes. Raises `BadArgument` for arguments that only one cloud can have.
+    They are shape, observer, reachable, arm, regions, and a table with an edge.
     """
     for name in ("shape", "observer", "reachable", "arm", "keep", "avoid"):
         if given.get(name) is not None:
@@ -74,11 +75,11 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
 def plan_stacks(
     requests: Sequence[Request], prepared: Iterator[Objects | Grasps], device: torch.device
 ) -> Iterator[Grasps]:
-    """Yield the grasps of each request; the device plans a stack of many objects at once.
+    """Yield the grasps of each request; the `device` plans up to 128 objects at once.
 
-    The requests differ in their clouds alone. `prepared` yields the object of each request
-    (`pose_request`). For a refused cloud it yields an empty set of grasps, which is passed on. The
-    objects of the next stack are prepared while the device plans.
+    The number is `MANY.stack`. The requests differ in their clouds alone. `prepared` yields the
+    object of each request, with its shape and initial guesses. For a bad cloud it yields an empty
+    set of grasps, which is passed on. The next objects are prepared while the device plans.
     """
     most = MANY.stack
     deadline = requests[0].deadline() if requests else math.inf
@@ -104,7 +105,8 @@ def estimate_shapes(
 ) -> Generator[Objects | Grasps, None, None]:
     """Yield the object of each request on the CPU, or an empty set of grasps for a bad cloud.
 
-    The objects are those of `pose_request`. `workers` is the number of processes, 0 for none.
+    Each object has its estimated shape and initial guesses (`pose_request`). The metadata of the
+    empty set say why the cloud is bad. `workers` is the number of processes, 0 for none.
     """
     return _each(
         _prepare, [dataclasses.replace(x, cloud=x.cloud.to("cpu")) for x in requests], workers
@@ -162,7 +164,7 @@ def _refused(hand: Hand, reason: str) -> Grasps:
 
 
 def no_grasps(hand: Hand) -> Grasps:
-    """Return an empty set of grasps; its tensors have the axes of the hand's joints and fingers."""
+    """Return 0 grasps; their empty tensors have the axes of the hand's joints and fingers."""
     f = len(hand.tips)
 
     def none(*shape: int) -> torch.Tensor:

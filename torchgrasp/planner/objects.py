@@ -74,7 +74,7 @@ CloudIndex = Int[Tensor, "b"]
 class LearnedModel(NamedTuple):
     """The learned posture mixture of a planning mode, and the SHA-256 of its file.
 
-    A mode without one has None and "none".
+    In the mode "joint", which uses no mixture, they are None and "none".
     """
 
     mixture: GraspMixture | None = None
@@ -210,12 +210,14 @@ class Objects:
 
     @property
     def slipping(self) -> ContactSpec:
-        """The constraints of the first object, planned with all of the mean friction."""
+        """The constraints of the first object, with the whole mean friction as planned friction
+        (`friction_margin` 1).
+        """
         return dataclasses.replace(self.spec, friction_margin=1.0)
 
     @property
     def strongest(self) -> float:
-        """The greatest normal force [N] of a finger in the task."""
+        """The greatest normal force [N] with which a finger presses in the task."""
         return self.request.grasp_task.pressing(self.lifts) or GRIP
 
     @property
@@ -224,10 +226,10 @@ class Objects:
         return self.request.grasp_task.lifts(self.spec.plane)
 
     def weight_on(self, contacts: Contacts, cloud: CloudIndex) -> Float[Tensor, "b 6"]:
-        """Return the mean weight of each contact set's object.
+        """Return the mean weight of each contact set's object, as a wrench in the upright frame.
 
-        It is a force [N] and a torque [N m] about the contacts' centroid. `cloud` is the index of
-        each contact set's object.
+        It is a force [N], then a torque [N m] about the contacts' centroid. `cloud` (b,) is the
+        index of each contact set's object.
         """
         center = self.body.rows(cloud).center.to(contacts.points)
         mass = Distribution.of(self.request.grasp_task.mass).mean
@@ -258,8 +260,9 @@ class Objects:
         ).all(0)
 
     def relaxed_specs(self) -> Iterator[ContactSpec]:
-        """Yield the constraints of `ContactSpec.relaxed` for a single object, in the caller's
-        frame.
+        """Yield ever weaker constraints on contacts of a single object, in the caller's frame.
+
+        They are those of `ContactSpec.relaxed`: first with smaller flat radii.
         """
         radius = float(self.hand.tips.radius.max())
         return iter(self.given_spec.relaxed(self.spec.ring_radius, radius))
@@ -278,7 +281,8 @@ class Objects:
     ) -> GraspProblem:
         """Return the inverse-kinematics problem of b contact sets with their certificates.
 
-        `cloud` is the index of each contact set's object.
+        Contacts [m] are in the upright frame. `cloud` (b,) is the index of each contact set's
+        object.
         """
         center = self.body.rows(cloud).center
         world = self.world.rows(cloud)
@@ -289,7 +293,7 @@ class Objects:
     def slide(self, cloud: CloudIndex) -> JointProblem:
         """Return the problem in which hand and contacts move together, for b contact sets.
 
-        `cloud` is the index of each contact set's object.
+        `cloud` (b,) is the index of each contact set's object.
         """
         constraints = self.constraints.rows(cloud)
         return JointProblem(
@@ -299,7 +303,8 @@ class Objects:
     def on_arm(self, grasps: Grasps) -> Grasps:
         """Return the grasps, with the arm's postures if there is an arm.
 
-        Executable grasps for which the arm has no way (`with_arm`) get the status `UNREACHABLE`.
+        The arm must follow approach and lift within its limits and without a collision. Executable
+        grasps for which it cannot get the status `UNREACHABLE`.
         """
         arm = self.request.arm
         if arm is None:
@@ -382,11 +387,12 @@ def pose(
     """Return one object with its hand, constraints, initial guesses and obstacles (upright frame).
 
     Args:
-        object_: the object, with its shape.
+        object_: the object, with its estimated shape.
         request: the arguments of the plan.
         hand: the hand of the plan.
         model: the learned model of the mode.
-        spec: constraints in the caller's frame; by default the request's, on the object's table.
+        spec: constraints in the caller's frame; None means those of the request, with the object's
+            table.
         postures: size of the posture library; None means the default.
         descends: whether the hand may move down while it closes.
     """
@@ -442,7 +448,9 @@ def pose(
 
 
 def join_objects(parts: Sequence[Objects], device: torch.device) -> Objects:
-    """Return single posed objects without scenes (`parts`) as one batch on a device."""
+    """Return single objects, which `pose` has prepared, as one batch on a device. They must not be
+    in scenes.
+    """
     first = parts[0]
     shape = ShapeBatch.of([part.each[0].shape for part in parts], device)
     rings = shape.scales.new_tensor([part.spec.ring_radius for part in parts])
@@ -510,8 +518,8 @@ def _is_surrounded(shape: ShapeGP, on_table: bool) -> bool:
 def is_buried(surface: Mesh, obstacles: Obstacles | None) -> bool:
     """Return whether obstacles prevent that an object is lifted.
 
-    They do if the rising object would enter them clearly deeper than at rest. `surface` is the
-    object's mesh [m].
+    They do if the rising object would enter them more than 3 mm (`BURIED`) deeper than at rest.
+    `surface` is the object's mesh [m], in the frame of the obstacles. None means no obstacles.
     """
     if obstacles is None or not obstacles.hard:
         return False
@@ -528,7 +536,7 @@ def settle_hand(hand: Hand, device: torch.device) -> Hand:
 
 @checked
 def take_target(scene: Scene, seed: Seed) -> PointCloud:
-    """Return at most `TARGET_POINTS` random points of a scene's target, as a cloud.
+    """Return at most 1000 (`TARGET_POINTS`) random points of a scene's target, as a cloud.
 
     Raises `BadArgument` unless the target is the label of an object.
     """

@@ -47,8 +47,9 @@ steps.
 
 
 def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:
-    """Yield the grasps of each batch as a list, with the grasps of each object, executable ones
-    first.
+    """Yield for each batch a list with the grasps of each object, executable ones first.
+
+    A batch has some of the initial guesses.
 
     The grasps are in the upright frame. Their `meta` says how many initial guesses were planned so
     far. No batch begins after `deadline` [s], a time of `time.monotonic`.
@@ -84,7 +85,11 @@ def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:
 
 
 def plan_object(objects: Objects, deadline: float) -> Iterator[Grasps]:
-    """Yield the grasps of each batch of the one object in `objects`, as `plan_objects` does."""
+    """Yield the grasps of each batch of initial guesses of the one object in `objects`.
+
+    Executable grasps come first. They are in the upright frame. No batch begins after `deadline`
+    [s], a time of `time.monotonic`.
+    """
     for (grasps,) in plan_objects(objects, deadline):
         yield grasps
 
@@ -92,12 +97,12 @@ def plan_object(objects: Objects, deadline: float) -> Iterator[Grasps]:
 def step(
     objects: Objects, rows: Candidates, tried: int, turn: int, last: bool
 ) -> tuple[Candidates, Grasps, CloudIndex]:
-    """Try at most `tried` further contact sets of each object, and return three results.
+    """Try to grasp at most `tried` further contact sets of each object.
 
-    The first are all contact sets `rows` with the results. The others are the best grasps of those
-    that ended now, and the index of each grasp's object. `turn` is the number of the batch, from 1,
-    and `last` says whether it is the last one. In a mode other than "joint", `solve_all` solves for
-    all sets, and `rows` stay unchanged.
+    Return three results: all contact sets `rows` with their new states and grasps; the best grasp
+    of each set whose search ended in this batch; the index of each grasp's object. `turn` is the
+    number of the batch, from 1, and `last` says whether it is the last one. In a mode other than
+    "joint" all sets are tried (`solve_all`), and `rows` stay unchanged.
     """
     if objects.request.mode != "joint":
         grasps = solve_all(objects, rows)
@@ -117,10 +122,10 @@ def try_first(
 ) -> tuple[Candidates, Int[Tensor, "e"]]:
     """Solve for the hand on fixed contacts with few solver steps, for an early grasp.
 
-    `rows` are all contact sets, and `fresh` holds the indices of those to try. Return all contact
-    sets with the results, then the indices of those that ended. A solved set ends (`Row.ENDED`); a
-    failed one gets `Row.BEGUN`. For an object without a grasp by then, `try_fully` goes on with its
-    sets at once.
+    `rows` are all contact sets, and `fresh` holds the indices of those to try. Return `rows` with
+    the new states and grasps, then the indices of the sets whose search ended. A set with an
+    executable grasp gets the state `Row.ENDED`, a failed one `Row.BEGUN`. For an object without a
+    grasp by then, `try_fully` goes on with its sets at once.
     """
     rows, solved = solve_fixed(objects, rows, fresh, FEW_STEPS, Row.BEGUN)
     missing = without(rows, solved, len(objects))
@@ -138,12 +143,14 @@ def try_fully(
 ) -> tuple[Candidates, Int[Tensor, "e"]]:
     """Solve for the hand on fixed contacts with all solver steps, then with sliding contacts.
 
-    `rows` are all contact sets, and `tried` holds the indices of those to try. Those with the
-    indices `ended` ended earlier in this batch. Return all contact sets with the results, then
-    `ended` with the indices of those that ended now. A solved set ends (`Row.ENDED`); a failed one
-    gets `Row.STUCK`. `solve_with_sliding` then tries stuck sets, and ends them. It takes long. So
-    in the `last` batch it tries all stuck sets. In others it tries those of objects without a grasp
-    in this batch.
+    `rows` are all contact sets, and `tried` holds the indices of those to try. `ended` holds the
+    indices of those whose search ended earlier in this batch. Return `rows` with the new states and
+    grasps, then `ended` with the indices of the sets whose search ended now.
+
+    A set with an executable grasp gets the state `Row.ENDED`, a failed one `Row.STUCK`. Sliding
+    contacts (`solve_with_sliding`) take long. In the `last` batch they are tried for all stuck
+    sets. In others they are tried for stuck sets of objects without a grasp in this batch. The
+    search of these sets then ends.
     """
     clouds = len(objects)
     rows, solved = solve_fixed(objects, rows, tried, ITERATIONS, Row.STUCK)
@@ -172,9 +179,10 @@ def solve_fixed(
 ) -> tuple[Candidates, Int[Tensor, "s"]]:
     """Solve for the hand on fixed contacts, with at most `steps` solver steps.
 
-    `rows` are all contact sets, and `now` holds the indices of those to try. Return all contact
-    sets with the results, then the indices of the solved ones. Solved sets get `Row.ENDED` and
-    their executable grasp. The others in `now` get the status `failed` and their best failed grasp.
+    `rows` are all contact sets, and `now` holds the indices of those to try. Return `rows` with the
+    new states and grasps, then the indices of the sets that have an executable grasp now. These
+    sets get the state `Row.ENDED`. The others in `now` get the state `failed` and their best failed
+    grasp.
     """
     contacts, certificate, seeds = rows.select(now)
     reach = objects.reach(contacts, certificate, rows.cloud[now])
@@ -189,9 +197,10 @@ def solve_with_sliding(
 ) -> tuple[Candidates, Int[Tensor, "k"]]:
     """Solve for hand and contacts together, where the contacts slide on the surface.
 
-    `rows` are all contact sets, and `now` holds the indices of those to try. Return all contact
-    sets with the results, then the indices in `now`, in any order. Each tried set gets `Row.ENDED`
-    and its best grasp so far, which may be a failed one.
+    `rows` are all contact sets, and `now` (k,) holds the indices of those to try. Each must have a
+    failed grasp from its fixed contacts. Return `rows` with the new states and grasps, then the
+    same k indices, in any order. Each set of `now` gets the state `Row.ENDED` and its best grasp so
+    far, which may be a failed one.
     """
     contacts, certificate, seeds = rows.select(now)
     attempts = Attempts(torch.ones_like(certificate.closed), executable)
@@ -204,7 +213,7 @@ def solve_with_sliding(
 
 
 def solve_all(objects: Objects, rows: Candidates) -> Grasps:
-    """Return the grasps of all contact sets `rows`, executable ones first, in a single batch.
+    """Return the grasps of all contact sets `rows`, executable ones first.
 
     The mode "paper" uses `solve_as_paper`, the mode "contact_first" `solve_contact_first`.
     """

@@ -37,11 +37,13 @@ of a view.
 
 
 def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
-    """Return the grasps of each object in the request's order, scored by log-odds, on the CPU.
+    """Return for each object its grasps, best first, on the CPU.
 
-    `cloud` is the index of each grasp's object. If the object cannot be lifted out of its
-    surroundings, its grasps get the status `BURIED`. Grasps of less success than a promise needs
-    get `NO_PROMISE`.
+    The best grasp has the greatest predicted success, or the least variance (`Request.order`). A
+    grasp's `score` is the log-odds of its success. `cloud` (g,) is the index of each grasp's
+    object. If the object cannot be lifted out of its surroundings, its grasps get the status
+    `BURIED`. Grasps that the arm cannot follow get `UNREACHABLE`, and grasps that resist less than
+    the loads `NOT_RESISTED`. Grasps of less success than a promise needs get `NO_PROMISE`.
     """
     request = objects.request
     if objects.buried:
@@ -70,11 +72,13 @@ def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
 def predict(
     objects: Objects, grasps: Grasps, cloud: CloudIndex
 ) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"]]:
-    """Return the log-odds of success of g grasps, then the probability that trials support them.
+    """Return the log-odds (g,) of success of g grasps. Return then the share (g,) of the conditions
+    for which similar grasps were tried.
 
-    The success is the mean over the distributions of friction and mass. It falls by `UNCARRIED`
-    where the mean weight cannot be lifted with the mean friction. With obstacles, it includes
-    that the hand hits none. `cloud` is the index of each grasp's object.
+    The conditions are the distributions of friction and mass; the success is the mean over them.
+    Its log-odds fall by 2.1 (`UNCARRIED`) where the fingers cannot carry the mean weight with the
+    mean friction. With obstacles, success also needs that the hand hits none. `cloud` (g,) is the
+    index of each grasp's object.
     """
     task = objects.request.grasp_task
     spec = objects.spec

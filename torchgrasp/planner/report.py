@@ -50,8 +50,8 @@ class Report:
         self.closed = 0
 
     def shape(self) -> None:
-        """Report the estimated shape, and the share of its surface that is certain to
-        `REPORT.certain`.
+        """Report the estimated shape, and the share of its surface whose standard deviation is
+        below 4 mm (`REPORT.certain`).
         """
         if not self.heard:
             return
@@ -69,8 +69,8 @@ class Report:
     def note(self, stage: str, value: Any, offered: int = 0) -> None:
         """Store the result of one stage of one batch, and report the stage after its last batch.
 
-        `stage` is its name, and `value` the result. `offered` is the number of contact sets that
-        stage "certify" checked.
+        `stage` is "plan", "certify" or "query", and `value` its result. `offered` is the number of
+        contact sets that stage "certify" checked; other stages do not use it.
         """
         if not self.heard:
             return
@@ -115,6 +115,6 @@ class Report:
 
 
 def describe(counts: dict[Status, int]) -> str:
-    """Return how often each status occurs, as one line of text that begins with the successes."""
+    """Return the number of each status as one line of text, which begins with `Status.OK`."""
     ordered = sorted(counts.items(), key=lambda pair: pair[0] is not Status.OK)
     return ", ".join(f"{n} {s.name.lower()}" for s, n in ordered) or "none"

@@ -54,14 +54,14 @@ class Request:
         mode: how planned contacts become grasps.
         ranking: criterion by which grasps are ordered; None means that of the mode.
         task: what the grasps must do; None means `GraspTask()`.
-        promise: share of the returned grasps that must hold, or None.
-        shape: the object's shape, if it is known.
-        observer: function that is called after each stage.
-        reachable: function that says which hand poses an arm reaches.
-        arm: the arm that carries the hand.
-        keep: region in which all contacts lie.
-        avoid: region in which no contact lies.
-        resist: loads that the contacts must resist.
+        promise: share of the executable grasps that must hold; None means no promise.
+        shape: the object's shape, if it is known; None means that it is estimated.
+        observer: function that is called after each stage; None means no call.
+        reachable: function that says which hand poses an arm reaches; None means all of them.
+        arm: the arm that carries the hand; None means no arm.
+        keep: region in which all contacts lie; None means anywhere.
+        avoid: region in which no contact lies; None means none.
+        resist: loads that the contacts must resist; None means none.
         time_budget: wall time [s] after which no batch begins; None means no limit.
     """
 

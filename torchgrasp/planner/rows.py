@@ -42,13 +42,13 @@ class Row(enum.IntEnum):
     """The state of a contact set in the search for grasps."""
 
     SEEDED = 0
-    """The contact set has force closure and initial hand postures, and waits to be tried."""
+    """The contact set has force closure and initial hand postures. No grasp was tried yet."""
     BEGUN = 1
-    """A few solver steps on its fixed contacts failed."""
+    """A few solver steps for the hand, with fixed contacts, gave no executable grasp."""
     STUCK = 2
-    """All solver steps on its fixed contacts failed."""
+    """All solver steps for the hand, with fixed contacts, gave no executable grasp."""
     ENDED = 3
-    """Its grasp is executable, or failed with sliding contacts, too."""
+    """The search ended: a grasp is executable, or contacts that slide with the hand failed, too."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ class ChoiceNumbers:
     """Parameters by which planned contact sets are chosen for the hand to try."""
 
     likely: int = 2
-    """Farthest-point sampling takes n sets from the `likely` * n sets of the lowest cost."""
+    """Farthest-point sampling takes n sets to try from the `likely` * n sets of least cost."""
     weak: float = 1e6
     """Cost of contact sets that resist less than the task's loads: above all other costs."""
     tried: int = 2
@@ -66,7 +66,7 @@ class ChoiceNumbers:
     lever: float = 0.3
     """Weight of the load's lever arm relative to the fingertips' errors, both as logarithms."""
     short: float = 0.1
-    """Lever arm (no unit, see `lever_arm`) below which a shorter one hardly counts."""
+    """Lever arm (no unit, of `lever_arm`) below which differences of lever arms hardly count."""
     touching: float = 1e-3
     """Sum of squared errors [mm2] below which initial postures count as equally near."""
 
@@ -87,7 +87,7 @@ class Candidates:
             loads it is the weight in a lift, else 0.
         cost: cost (no unit; less is better) by which the next contact sets to try are chosen.
         cloud: index of each contact set's object.
-        status: a `Row` for each contact set.
+        status: the state of each contact set, a `Row`.
         turn: number of the batch in which each contact set was first tried, from 1; 0 if it was
             not.
         grasp: index in `grasps` of each tried contact set's best grasp, or -1.
@@ -129,10 +129,10 @@ class Candidates:
         return len(self.cloud)
 
     def find(self, status: Row, clouds: Bool[Tensor, "c"] | None = None) -> Int[Tensor, "k"]:
-        """Return the indices of the contact sets with a status, in the order in which they were
-        tried.
+        """Return the indices of the contact sets in the state `status`, in the order in which they
+        were tried.
 
-        `clouds` is a mask of c objects whose contact sets count; by default all count.
+        `clouds` is a mask of the c objects whose contact sets count; None means all objects.
         """
         chosen = self.status == status
         if clouds is not None:
@@ -154,16 +154,15 @@ class Candidates:
         return self.contacts[rows], self.certificate[rows], seeds
 
     def begin(self, rows: Int[Tensor, "k"], turn: int) -> "Candidates":
-        """Return the contact sets, with those of the indices `rows` marked as first tried in batch
+        """Return all contact sets; those with the indices `rows` are marked as first tried in batch
         number `turn`.
         """
         return dataclasses.replace(self, turn=self.turn.index_fill(0, rows, turn))
 
     def put(self, rows: Int[Tensor, "k"], grasps: Grasps, status: Int[Tensor, "k"]) -> "Candidates":
-        """Return the contact sets, with the best grasp and the status of those with the indices
-        `rows` replaced.
+        """Return all contact sets; those with the indices `rows` get new best grasps and states.
 
-        `grasps` and `status` hold one grasp and one `Row` for each of the k indices.
+        `grasps` and `status` hold one grasp and one state (`Row`) for each of the k indices.
         """
         before = 0 if self.grasps is None else len(self.grasps)
         index = torch.arange(before, before + len(rows), device=rows.device)
@@ -315,8 +314,9 @@ def _spread(plan: ContactPlan, cloud: CloudIndex, most: int, clouds: int) -> Int
 
 @checked
 def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
-    """Return the indices of at most `most` successful contact sets of a plan that lie far apart,
-    ascending.
+    """Return the indices, ascending, of at most `most` successful contact sets of a plan.
+
+    Farthest-point sampling of the contacts' coordinates chooses sets that differ much.
     """
     rows = flatnonzero(plan.status == Status.OK)
     if len(rows) <= most:
@@ -327,10 +327,10 @@ def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
 
 
 def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSeeds:
-    """Return initial hand postures near the contacts; `cloud` is the index of each contact set's
-    object.
+    """Return initial hand postures near the contacts of b sets.
 
-    In mode "joint" they are random postures, in other modes those of the learned model.
+    Contacts [m] are in the upright frame, and `cloud` (b,) is the index of each set's object. In
+    mode "joint" they are random postures, in other modes those of the learned model.
     """
     mixture = objects.model.mixture
     if mixture is None:
@@ -344,15 +344,15 @@ def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSee
 def with_costs(objects: Objects, found: Candidates) -> Candidates:
     """Return `found` with the cost of each contact set (no unit; less is better).
 
-    The cost is log(max(e, `CHOICE.touching`)) + `CHOICE.lever` log(a + `CHOICE.short`). Here a is
-    the set's lever arm (`lever_arm`). The cost e is the least of the `seed_costs` [mm2] of its
-    first `CHOICE.tried` initial postures, and infinite without any.
+    The cost is log(max(e, 0.001)) + 0.3 log(a + 0.1), with the numbers of `CHOICE`. Here a is the
+    lever arm of the set's load, without unit (`lever_arm`). The number e [mm2] is the least cost of
+    its first two initial postures (`seed_costs`), and infinite without any.
 
     With loads to resist, or a weight to lift, the initial postures of each set are sorted first.
-    The greatest share of the load that they carry, at most 1, comes first. A set whose postures all
-    carry less than the load costs from `CHOICE.weak` to 2 `CHOICE.weak` more. A weight meets all of
-    the mean friction. Without it, two fingers at a thin wall and one on the floor of a pan would
-    do.
+    Those that carry the greatest share of the load, at most 1, come first. A set whose postures all
+    carry less than the load costs 1e6 to 2e6 more (`CHOICE.weak`). A weight is carried with the
+    whole mean friction. Without this, two fingers at a thin wall and one on the floor of a pan
+    would do.
     """
     contacts = found.contacts
     seeds = found.seeds
@@ -399,9 +399,9 @@ def _carried(objects: Objects, found: Candidates, spec: ContactSpec) -> Float[Te
 def choose(rows: Candidates, most: int, clouds: int) -> Int[Tensor, "k"]:
     """Return the indices of the next contact sets to try: at most `most` of each object.
 
-    Farthest-point sampling chooses them among the untried sets of low cost. They are far from each
-    other, and from the sets that were tried before. `rows` are all contact sets, and `clouds` is
-    the number of objects. All objects are sampled at once, on their device.
+    Farthest-point sampling chooses them among the 2 `most` untried sets of least cost. They are far
+    from each other, and from the sets that were tried before. `rows` are all contact sets, and
+    `clouds` is the number of objects. All objects are sampled at once, on their device.
     """
     if not len(rows):
         return rows.cloud
@@ -463,8 +463,9 @@ def by_cloud(cloud: CloudIndex, clouds: int) -> list[Int[Tensor, "k"]]:
 
 
 def sorted_points(contacts: Contacts) -> Float[Tensor, "b d"]:
-    """Return each contact set as one vector of d = 3 f coordinates [m], its contacts sorted by
-    height.
+    """Return each contact set as one vector of d = 3 f coordinates [m].
+
+    Its f contacts are sorted by ascending z.
     """
     order = torch.argsort(contacts.points[..., 2], dim=1, stable=True)
     return contacts.points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)

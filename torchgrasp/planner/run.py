@@ -32,9 +32,10 @@ def plan_request(request: Request) -> Grasps:
 
 
 def plan_shaped(object_: ShapedObject, request: Request) -> Grasps:
-    """Return the grasps of a request, as `plan_request` does, on an object that is shaped already.
+    """Return the grasps of a request on an object whose shape is estimated already.
 
-    The table is that of `object_`. Of several sets of fingers the first is used.
+    Executable grasps come first, best first. They are in the caller's frame. The table is that of
+    `object_`. Of several sets of fingers the first is used.
     """
     objects = pose(object_, request, request.hands[0], find_model(request))
     batches = [objects.give_back(grasps) for grasps in plan_hand(objects, math.inf)]
@@ -65,22 +66,23 @@ def finish(request: Request, batches: list[Grasps]) -> Grasps:
 def plan_hand(objects: Objects, deadline: float) -> Iterator[Grasps]:
     """Yield the grasps of the one object in `objects`, batch by batch of initial guesses.
 
-    If no grasp is likely to hold, further batches are planned with relaxed constraints (`relax`).
-    No batch begins after `deadline` [s], a time of `time.monotonic`.
+    If no grasp has a predicted success above 0.5 (`LIKELY`), further batches are planned with
+    relaxed constraints (`relax`). No batch begins after `deadline` [s], a time of `time.monotonic`.
     """
     yield from relax(objects, plan_object(objects, deadline), deadline)
 
 
 def relax(objects: Objects, batches: Iterator[Grasps], deadline: float) -> Iterator[Grasps]:
-    """Yield batches of a single object; if no grasp is likely to hold, plan also with relaxed
-    constraints.
+    """Yield batches of grasps of a single object; if no grasp is likely to hold, plan also with
+    relaxed constraints.
 
-    A contact set must be flat within the largest of `FLAT_RADII` that the object allows, which can
-    leave few contacts. With relaxed constraints (`ContactSpec.relaxed`) the hand may begin above
-    its pose, too, and go down while it closes (`opened_pose`). Of earlier constraints, the batches
-    up to the last one with an executable grasp are kept. Of the last constraints, all batches are
-    kept. `batches` are those of the first constraints. After `deadline` [s], a time of
-    `time.monotonic`, constraints are no longer relaxed.
+    Likely is a predicted success above 0.5 (`LIKELY`). Contacts must be flat within the largest of
+    four radii that the object allows (`FLAT_RADII`), which can leave few contacts. With relaxed
+    constraints (`ContactSpec.relaxed`) the hand may begin above its pose, too, and go down while it
+    closes (`opened_pose`). Of earlier constraints, the batches up to the last one with an
+    executable grasp are kept. Of the last constraints, all batches are kept. `batches` are those of
+    the first constraints. After `deadline` [s], a time of `time.monotonic`, constraints are no
+    longer relaxed.
     """
     failed = list[Grasps]()
     best = 0.0

@@ -40,8 +40,8 @@ class BatchSize(NamedTuple):
 def batch_sizes(mode: Mode, starts: int, crowded: bool) -> list[BatchSize]:
     """Return the sizes of the batches of a plan with `starts` initial guesses.
 
-    A `mode` other than "joint" has one batch. `crowded` says whether the object is in a scene,
-    where the hand tries fewer contact sets.
+    A `mode` other than "joint" has one batch. `crowded` says whether the object is in a scene. The
+    hand tries at most 250 contact sets there, 160 in a scene (`SCHEDULE`).
     """
     most = SCHEDULE.tried_in_scene if crowded else SCHEDULE.tried
     return schedule(starts, most) if mode == "joint" else [BatchSize(starts, most)]
@@ -51,7 +51,8 @@ def schedule(starts: int, most: int) -> list[BatchSize]:
     """Return the sizes of batches with `starts` initial guesses, and `most` contact sets for the
     hand, in all.
 
-    A small remainder joins the last batch.
+    Each batch is six times (`SCHEDULE.growth`) as large as the one before. A small remainder joins
+    the last batch.
     """
     batches = list[BatchSize]()
     size = SCHEDULE.first

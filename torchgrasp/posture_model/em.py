@@ -97,7 +97,7 @@ class DataRows:
         return int(self.sum(self.rows.new_tensor(len(self.rows), dtype=torch.int64)))
 
     def lengths(self) -> Int[Tensor, "p"]:
-        """Return the number of rows in each of the p processes."""
+        """Return the number of samples (rows) in each of the p processes."""
         lengths = self.rows.new_zeros(self.processes, dtype=torch.int64)
         lengths[self.rank] = len(self.rows)
         return self.sum(lengths)
@@ -189,8 +189,8 @@ def expectation_maximisation(
     """Fit a mixture by EM steps from the state `start`, until `rule` ends them.
 
     `shard` holds the data rows of this process; `observer` is called with the state after each
-    step. Raises `IndefiniteCovariance` for a start with an indefinite covariance, or a component
-    that collapses too often.
+    step. Raises `IndefiniteCovariance` for a start with an indefinite covariance. Raises it also if
+    a component collapses more than three times: singular covariance, or too few samples.
     """
     n = shard.count()
     state = start
@@ -288,8 +288,8 @@ def maximisation(
         reseeded: how often each component has collapsed before.
 
     A component collapses if its covariance is singular or it has fewer than d + 1 rows. It is
-    replaced by half of the heaviest component, split across its longest axis. After
-    `EM.most_reseeds` times, `IndefiniteCovariance` is raised.
+    replaced by half of the heaviest component, split across its longest axis. Raises
+    `IndefiniteCovariance` if a component collapses more than three times (`EM.most_reseeds`).
     """
     components = components_from_sums(sums, n, regularisation)
     covariances = components.covariances

@@ -111,8 +111,8 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
 def describe_compatibility(hand: Hand) -> dict[str, str]:
     """Return metadata that identifies the hand of samples and models.
 
-    It holds the hand's name, its fingers, a hash of its files, and the contact codes of three
-    postures.
+    It holds the hand's name, its grasping fingers, a hash of its files, and the contact codes of
+    three postures. The postures depend on the joint limits alone.
     """
     codes = " ".join(f"{x:.7f}" for x in _probe_codes(hand).flatten().tolist())
     return {
@@ -127,7 +127,8 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
     """Raise `BadArgument` for the model of another hand, or of other fingers, joint limits or
     fingertips.
 
-    `meta` and `joint_names` are those of the model.
+    `meta` and `joint_names` are those of the model. Without "hand_codes" in `meta`, only the names
+    of the joints are compared.
     """
     if joint_names != hand.joint_names:
         raise BadArgument(
@@ -381,8 +382,8 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
 def mixture_path(name_or_path: Path | str) -> Path:
     """Return the path of a mixture, given by the path of a .safetensors file or by a hand.
 
-    Such a path is returned unchanged. For a hand's name or folder, it is mixture.safetensors in the
-    folder.
+    The path of a .safetensors file is returned unchanged. For a hand's name or folder, the result
+    is the path of mixture.safetensors in the hand's folder.
     """
     if Path(name_or_path).suffix == ".safetensors":
         return Path(name_or_path)

@@ -38,9 +38,10 @@ def roll_contacts(
     """Return (points, normals) of random contacts off the centres of the fingertips' pads.
 
     The points [m] and the fingertips' outward unit normals there are in the hand's frame. They are
-    for n postures `joints` [rad] of three fingers. `generator` tilts each normal at random from the
-    pad's axis. The tilt has Gaussian components, cut off at the pad's cone. On a round fingertip
-    the contact moves to the point of the sphere with this normal. On a flat pad it stays in place.
+    for n postures `joints` [rad or m] of three fingers. `generator` tilts each normal at random
+    from the pad's axis. The tilt has Gaussian components, cut off at the pad's cone. On a round
+    fingertip the contact moves to the point of the sphere with this normal. On a flat pad it stays
+    in place.
     """
     points, axes = hand.fingertips(joints)
     cone = hand.tips.cone.to(axes)
@@ -60,7 +61,7 @@ def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -
     """Return a mask of the n postures of which some three contacts can have force closure, Eq.
     (13).
 
-    These contacts can balance forces within their friction cones. The search tries a grid of forces
+    Such contacts can balance forces within their friction cones. The search tries a grid of forces
     along the triangle's sides and can miss marginal cases. `points` [m] and unit `normals`, which
     point into the object, are those of the f contacts.
     """
@@ -223,7 +224,7 @@ def sample_configurations(
 def chunk_sizes(n: int) -> list[int]:
     """Return the numbers of postures of the chunks that n postures are split into.
 
-    Each is `CHUNK_POSTURES`; the last has the rest.
+    Each is 10,000 (`CHUNK_POSTURES`); the last is the rest.
     """
     return [min(CHUNK_POSTURES, n - first) for first in range(0, n, CHUNK_POSTURES)]
 
@@ -231,11 +232,11 @@ def chunk_sizes(n: int) -> list[int]:
 def draw_chunk(
     hand: Hand, spec: SampleSpec, i: int
 ) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n q"], int]:
-    """Return (joints, codes, drawn) of chunk i: joints [rad], contact codes, number of postures
-    drawn.
+    """Return (joints, codes, drawn) of chunk i: joints [rad or m], contact codes, number of drawn
+    postures.
 
-    The n postures of the chunk are those that were kept of all that were drawn; `spec` says how.
-    Raises `BadArgument` for a hand of which almost none are kept.
+    The n postures of the chunk are those that were kept of all that were drawn; `spec` says which.
+    Raises `BadArgument` if less than one in a thousand (`LEAST_KEPT`) is kept.
     """
     count = chunk_sizes(spec.n)[i]
     parts = []

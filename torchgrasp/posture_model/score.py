@@ -33,7 +33,9 @@ GROWING = EmRule(iterations=100, tolerance=1e-3, regularisation=MAX_REGULARISATI
 @dataclasses.dataclass(frozen=True)
 class MixtureScore(Value):
     """Errors with which a learned model predicts the h joints of held-out postures from their
-    codes.
+    contact codes.
+
+    Errors of sliding joints are in [m] in place of [rad].
     """
 
     joint_names: tuple[str, ...]
@@ -41,11 +43,11 @@ class MixtureScore(Value):
     error: Float[Tensor, "h"]
     # standard deviation of the absolute error over the postures [rad]
     deviation: Float[Tensor, "h"]
-    # mean absolute error [rad] of the best of the `COMPARED_MODES` likeliest modes
+    # mean absolute error [rad] of the best of the four (`COMPARED_MODES`) likeliest components
     nearest_mode: float
-    paper_coverage: float  # share of codes of energy below `PAPER_ENERGY`
-    default_coverage: float  # share of codes of energy below `DEFAULT_ENERGY`
-    log_likelihood: float  # mean over the postures [nats]
+    paper_coverage: float  # share of codes of energy below the paper's 2 (`PAPER_ENERGY`)
+    default_coverage: float  # share of codes of energy below 6.3 (`DEFAULT_ENERGY`)
+    log_likelihood: float  # mean log-likelihood of the postures [nats]
     postures: int  # number of postures
 
     @property
@@ -72,7 +74,7 @@ class MixtureScore(Value):
         )
 
     def meta(self) -> dict[str, str]:
-        """Return the scores as metadata for the mixture's file."""
+        """Return the scores as texts by name, for the metadata of the mixture's file."""
         return {
             "held_out": str(self.postures),
             "held_out_log_likelihood": f"{self.log_likelihood:.6f}",

@@ -67,7 +67,7 @@ class Subsets:
 
 
 def halves(n: int) -> list[int]:
-    """Return the whole numbers n, n / 2, n / 4 and so on, rounded down, to 1."""
+    """Return the whole numbers n, n / 2, n / 4 and so on down to 1, each rounded down."""
     return [n >> k for k in range(n.bit_length())]
 
 
@@ -80,9 +80,9 @@ def fit_subsets(
 ) -> Fit:
     """Fit a mixture by EM to the subsets of the given `sizes`, one after another.
 
-    `start` is the state before the first step, and `observer` is called with that after each step.
-    The rule bounds the steps on all subsets together. The last log-likelihood is that of the last
-    subset.
+    `start` is the state before the first step, and `observer` is called with the state after each
+    step. `rule` ends the fit to each subset, and bounds the steps on all subsets together. The last
+    log-likelihood is that of the last subset.
     """
     for size in sizes[:-1]:
         fit = expectation_maximisation(subsets.take(size), start, rule, observer)
@@ -92,10 +92,11 @@ def fit_subsets(
 
 
 def fit_smallest(subsets: Subsets, start: FitProgress, rule: EmRule) -> Fit:
-    """Fit a mixture to the smaller subsets; the fit to all rows can go on from the result.
+    """Fit a mixture to the smallest subsets; the fit to all rows can go on from the result.
 
-    The smaller ones have at most `ENOUGH` times the rows of the smallest of `subsets`. `start` is
-    the state before the first step, and `rule` ends the steps of each fit.
+    They have at most eight times (`ENOUGH`) as many rows as the smallest one. If all rows are the
+    only subset, they are used. `start` is the state before the first step, and `rule` ends the fit
+    to each subset.
     """
     most = ENOUGH * subsets.sizes[0]
     sizes = [size for size in subsets.sizes[:-1] if size <= most] or subsets.sizes
@@ -105,8 +106,8 @@ def fit_smallest(subsets: Subsets, start: FitProgress, rule: EmRule) -> Fit:
 def growing_fits(shard: DataRows, start: FitProgress, rule: EmRule) -> Iterator[Fit]:
     """Yield fits to the rows of `shard` without end, each with one component more than the last.
 
-    The first begins at `start`. Each later fit starts from the last, with its heaviest component
-    split. `rule` ends the steps of each.
+    The first begins at `start`. Each later fit starts from the one before, with its heaviest
+    component split. `rule` ends each fit.
     """
     n = shard.count()
     while True:

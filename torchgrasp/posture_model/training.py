@@ -53,9 +53,9 @@ MIXTURES = MixtureNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """The checkpoint file of one fit; without a `path` there is none.
+    """The checkpoint file of one fit; a `path` of None means no file.
 
-    Process 0 writes it, all processes read it. `centre` and `scale` identify the data, and
+    Process 0 writes the file, all processes read it. `centre` and `scale` identify the data, and
     `settings` the fit.
     """
 
@@ -77,7 +77,7 @@ class Checkpoint:
     def load(self) -> FitProgress | None:
         """Return the saved state, or None if there is no file.
 
-        Raises `ModelFileError` for a damaged file, or `BadArgument` for that of another fit.
+        Raises `ModelFileError` for a damaged file, and `BadArgument` for the file of another fit.
         """
         progress = self._read(self.path) if self.path and self.path.exists() else None
         steps = len(progress.log_likelihood) if progress else 0
@@ -249,7 +249,7 @@ def fit_mixture(
 def information_criterion(components: Components, n: int, log_likelihood: float) -> float:
     """Return the Bayesian information criterion (BIC) of a fit to n samples; smaller is better.
 
-    `log_likelihood` [nats] is the mean over the samples, in their units.
+    `log_likelihood` [nats] is the mean over the samples, whose dimensions have their own units.
     """
     m, d = components.means.shape
     parameters = (m - 1) + m * d + m * d * (d + 1) // 2  # of weights, means and full covariances
@@ -262,10 +262,10 @@ def standardised_rows(
     """Return (rows, means, deviations): standardised data, and the original mean and deviation of
     each dimension.
 
-    The rows have mean 0 and variance 1 in each of the d dimensions: the joints [rad], then the
-    code. `distributed`: whether `samples` are only the part of this process. Raises `BadArgument`
-    for codes not of three fingertips, or too few samples for so many `components`. Raises it also
-    for a dimension that does not vary.
+    The rows have mean 0 and variance 1 in each of the d dimensions: the joints [rad or m], then the
+    code. `distributed` says whether `samples` are only the part of this process. Raises
+    `BadArgument` for codes not of three fingertips, or for less than d + 2 samples for each of
+    `components`. Raises it also for a dimension that does not vary.
     """
     if samples.q.shape[1] != len(CODE_NAMES):
         found = f"codes of {samples.q.shape[1]} numbers"
