@@ -289,8 +289,8 @@ def _in_metres(image: Tensor, unit: float | None) -> Image:
 def tell_step(depth: Image) -> tuple[str, ...]:
     """Return one note, a sentence, if an image's depths [m] have steps of 5 mm or more, else none.
 
-    Then each is a whole number of steps from the least one. The bound is `DEPTH.coarse`. Depths of
-    0 were not measured, and do not count.
+    Such depths are whole numbers of steps from the least one. The bound is `DEPTH.coarse`. Depths
+    of 0 were not measured, and do not count.
     """
     step = _step_of(depth[depth > 0])
     if step < DEPTH.coarse:

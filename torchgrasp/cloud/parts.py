@@ -183,9 +183,10 @@ def find_ground(
 ) -> SupportPlane | None:
     """Return the plane on which objects stand; None if there is none.
 
-    It is nearly level and at least `level_width` [m] wide, else any plane on which the cameras look
-    down. The points (n, 3) are in metres. `eye` holds the camera's position [m], or that of each
-    point; None if it is unknown. `up` is the unit vector that points up.
+    A nearly level plane at least `level_width` [m] wide is sought first. If there is none, any
+    plane counts on which the cameras look down. All are in one frame. The points (n, 3) are in
+    metres. `eye` holds the camera's position [m], or that of each point; None if it is unknown.
+    `up` is the unit vector that points up.
     """
     middle = None if eye is None else eye.reshape(-1, 3).mean(0)
     kinds = (

@@ -297,7 +297,7 @@ def _fit_normals(
 
 
 def compare_normals(points: Points, normals: Points) -> NormalCheck:
-    """Return how well normals agree among neighbouring points.
+    """Return how well normals agree with the normals of neighbouring points.
 
     `points` (n, 3) are in metres; `normals` (n, 3) may have any length.
     """
@@ -341,9 +341,9 @@ def lie_across(points: Points, normals: Points) -> bool:
 def point_inward(points: Points, normals: Points) -> bool:
     """Return whether normals (n, 3) point to the middle of their `points` (n, 3) [m].
 
-    Then the surface is inside out, or hollow. For outward normals, the sum of (p - c) . n is that
-    of the divergence theorem. It is three times the volume of a closed surface, and positive for a
-    view of a surface that bulges.
+    Then the surface is inside out, or hollow. They do if the sum of (p - c) . n is clearly
+    negative, for points p with the mean c and normals n. By the divergence theorem, outward normals
+    of a closed surface give a positive sum. So do those of a view of a surface that bulges.
     """
     away = points - points.mean(0)
     outward = float((away * unit_of_any(normals)).sum())

@@ -96,7 +96,7 @@ def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 def number_rows(rows: Shaped[Tensor, "n d"]) -> Int[Tensor, "n"]:
-    """Return the number of each of n rows among the distinct rows in ascending order, from 0.
+    """Return the index (n,) of each of n rows in the sorted list of distinct rows.
 
     `torch.unique` of whole rows takes much longer than that of one column after the other.
     """

@@ -190,7 +190,8 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
     def judge(
         self, model: LinearResiduals, trial: LinearResiduals, x: Step, damping: Damping
     ) -> Verdict:
-        """Return a mask of the steps that lower the cost, and the damping of the next steps.
+        """Return a mask (a,) of the steps that lower the cost, and the damping (a,) of the next
+        steps.
 
         `model` holds the residuals before the step, `trial` those after it. The damping is infinite
         for a problem that has converged or is stuck, which ends it.

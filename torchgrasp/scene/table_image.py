@@ -66,7 +66,10 @@ class TableImage(Value):
 
     @kept
     def height(self) -> Float[Tensor, "h w"]:
-        """The height of each pixel's point above the table [m]."""
+        """The height of each pixel's point above the table [m].
+
+        Where nothing was measured, it is the camera's height.
+        """
         return self.support.plane.height(self.points)
 
     @kept

@@ -79,8 +79,11 @@ def arrays_of(
     a: Float[Tensor, "#q n"],
     b: Float[Tensor, "#q 3 near"],
 ) -> Arrays:
-    """Return the arrays of the points of `of` with weights `a` of distances and `b` of normals, the
-    same or others for each query point.
+    """Return the observed points (3, n), two arrays of weights, and the kernel's length psi.
+
+    The points and the kernel are those of `of`. All q query points share the weights `a` of
+    distances and `b` of normals, or each has its own. Weights of normals become (1 or q, 3, n);
+    points without normals get 0.
     """
     shifts = a.new_zeros(len(b), 3, len(of.x))  # points without normals have weight 0
     shifts[..., : b.shape[2]] = b

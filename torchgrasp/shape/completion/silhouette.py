@@ -242,8 +242,8 @@ class Outlines(Value):
     ) -> Bool[Tensor, "*b"]:
         """Return a mask of the points [m] that may be on the hidden side.
 
-        They are at most 1 mm (`OUTLINE.beside`) beside the visual hull, and at most 4 mm in front
-        of the visible surface of any view.
+        They are less than 1 mm (`OUTLINE.beside`) outside the visual hull. They are also less than
+        4 mm in front of the visible surface of every view.
         """
         return (self.hull_distance(points) < OUTLINE.beside) & (
             self.violation(points) < OUTLINE.front
