@@ -37,7 +37,9 @@ class AdviceNumbers:
     down: float = 0.15
     """Greatest share of visible normals that point down; a camera above a table sees fewer."""
     z_up: float = 0.9
-    """The vertical is z above this cosine, as where none was given."""
+    """Cosine between the upward direction and z, above which the direction counts as z, the
+    default.
+    """
     along: float = 0.8
     """Cosine between the camera's ray and an outlier's offset from the others, above which it is a
     flying pixel.
@@ -76,9 +78,10 @@ def judge_view(
 ) -> list[Advice]:
     """Return advice on a cloud's camera, vertical, table and pixels, and on other bodies in it.
 
-    Refusals come first. `clean` is the cloud without outliers, with outward normals and perhaps an
-    estimated viewpoint. `up` is the unit vector that points up. A `table` of None is assumed at the
-    lowest point. `stands` is whether the object stands on a table.
+    Advice with `refused` True comes first. `clean` is the cloud without outliers, with outward
+    normals and perhaps an estimated viewpoint. `up` is the unit vector that points up. A `table` of
+    None means a level plane at the lowest point. All are in the frame of the cloud. `stands` is
+    whether the object stands on a table.
     """
     points = clean.points.double()
     given = cloud.viewpoint is not None
@@ -116,8 +119,10 @@ def judge_view(
 def check_camera(clean: PointCloud) -> None:
     """Raise `BadArgument` if the given camera of a view cannot have seen the view's points.
 
-    `clean` is a cloud without outliers, with normals of either sign. A cloud without viewpoint
-    raises nothing.
+    It cannot if over 15 % of the points would be edge-on (`UNSEEN.edge_on`). It cannot either if
+    over 20 % would lie behind others (`UNSEEN.behind`). `clean` is a cloud without outliers, with
+    normals of either sign. A cloud without viewpoint raises nothing, nor does a view of fewer than
+    50 points.
     """
     found = _contradict(clean)
     if found is not None:

@@ -42,13 +42,15 @@ class AgreementNumbers:
     nobody saw.
     """
     astray: float = 0.7
-    """Greatest share of contacts that may be farther in trials, where some grasps may miss."""
+    """Greatest share of contacts that may be farther from their mesh in simulated trials, where
+    some grasps may miss.
+    """
     levels: int = 8
     """Number of depths behind each point of a cloud at which a region is sought."""
     unseen: float = 0.03
-    """Greatest distance [m] of contacts from a cloud, which is partial, and the space behind it."""
+    """Greatest distance [m] of contacts from a partial cloud and the space hidden behind it."""
     unseen_share: float = 0.5
-    """Greatest share of contacts that may be farther from such a cloud."""
+    """Greatest share of contacts that may be farther from the cloud and this space."""
     lowest: float = 0.02
     """Share of the points of an object that may be lower than its foot: outliers."""
     foot: float = 0.015
@@ -67,11 +69,11 @@ def check_agreement(
     share: float,
 ) -> float:
     """Return the median distance [m] of points from a mesh, or from a cloud and the space behind
-    it. Raise `BadArgument` if they lie off it.
+    it. Raise `BadArgument` if too many lie off it.
 
     At most the fraction `share` of the `points` (n, 3) [m] may be farther than `slack` [m] from
-    `other`. This is the mesh [m] or the cloud. Errors call the argument `name`, and its points
-    `what`.
+    `other`. This is the mesh [m] or the cloud, in the frame of the points. Errors call the argument
+    `name`, and its points `what`.
     """
     points = points.detach().cpu().double()
     points = points[draw_rows(len(points), AGREEMENT.drawn)]
@@ -95,9 +97,9 @@ def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -
 
     At most 20 % of the points (`AGREEMENT.share`) may be off it. A point is off if its distance
     exceeds 10 mm (`AGREEMENT.slack`) plus twice the camera's noise (`noise_of`). The mesh [m] is in
-    the frame of the cloud. Errors call it by `name`. The warning `CloudWarning` tells that most
-    points are farther from it than noise and pose error explain. An example is the mesh of a
-    similar object.
+    the frame of the cloud. Errors call it by `name`. A `CloudWarning` is given if the median
+    distance exceeds 0.5 mm (`AGREEMENT.beside`) plus noise and pose error. Then the mesh may be
+    that of a similar object.
     """
     noise = noise_of(cloud)
     slack = AGREEMENT.slack + 2 * noise
@@ -150,14 +152,18 @@ def check_seen(grasps: Grasps, cloud: PointCloud, name: str) -> None:
 
 
 def check_where(name: str, distance: Callable[[Points], Tensor], cloud: PointCloud) -> None:
-    """Raise `BadArgument` for a region "keep" that lies off a cloud and the space hidden behind it.
+    """Raise `BadArgument` for a region to keep to that lies off a cloud and the space hidden behind
+    it.
 
-    Such a region is more than 30 mm (`AGREEMENT.unseen`) from both. For a cloud without a camera
-    the bound grows by half the cloud's length, in place of the hidden space.
+    Contacts must lie in a region with the `name` "keep", and outside a region with another name. A
+    region is off if it is more than 30 mm (`AGREEMENT.unseen`) from cloud and hidden space. For a
+    cloud without a camera the bound grows by half the cloud's length, in place of the hidden space.
 
-    The function `distance` returns the signed distances [m] of points [m] in the frame of the
-    cloud. Errors call the argument `name`. A region of another `name` raises the warning `NoEffect`
-    instead. So does a region "keep" that holds the whole cloud and the space behind it.
+    The region is given by the function `distance`. It returns the signed distances [m] of points
+    [m] from the region, in the frame of the cloud. Errors call the argument `name`.
+
+    A region of another name that is off raises the warning `NoEffect` instead. So does a region
+    "keep" that holds the whole cloud and the space behind it.
     """
     rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
     seen = cloud.points[rows].double().cpu()
@@ -214,10 +220,11 @@ def check_foot(cloud: PointCloud, table: Plane) -> None:
 
 
 def warn_of_low_table(cloud: PointCloud, table: Plane) -> None:
-    """Warn of a table that is farther below its object's points than these are long.
+    """Warn (`NoEffect`) of a table that is farther below its object's points than the points
+    extend.
 
-    Such an object is in the air, as without a table: the space that its points hide reaches no
-    farther. The table is in the frame of the cloud.
+    Such an object counts as in the air, as without a table. The space hidden behind its points
+    reaches no farther than their extent. The table is in the frame of the cloud.
     """
     points = cloud.points.double().cpu()
     foot = float(table.height(points).quantile(AGREEMENT.lowest))
@@ -249,9 +256,11 @@ def noise_of(cloud: PointCloud) -> float:
 
 
 def distance_behind(points: Points, cloud: PointCloud) -> Float[Tensor, "n"]:
-    """Return each point's distance [m] from a cloud and the space hidden behind it.
+    """Return each point's distance (n,) [m] from a cloud and the space hidden behind it, 0 inside.
 
-    The hidden space reaches as far behind each point of the cloud as the cloud is long.
+    The hidden space reaches as far behind each point of the cloud as the cloud is long. Without a
+    camera it reaches half this length in all directions. `points` (n, 3) [m] are in the frame of
+    the cloud.
     """
     rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
     seen = cloud.points[rows].double().cpu()

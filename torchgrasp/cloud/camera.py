@@ -161,7 +161,7 @@ def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Imag
     """Return a mesh's exact depth image [m] in the default camera, and the cosine of the angle of
     incidence.
 
-    Both images are (`HEIGHT`, `WIDTH`), and 0 where a ray misses. The cosine is the absolute one
+    Both images are (480, 640), and 0 where a ray misses the mesh. The cosine is the absolute one
     between ray and face normal. The mesh is in metres. The pose (4, 4) [m] leads from the camera's
     frame (x right, y down, z forward) to the mesh's.
     """
@@ -228,11 +228,11 @@ def render_depth(
 ) -> tuple[Image, Int[Tensor, "h w"]]:
     """Return a depth image [m] of meshes on a table, as the default camera measures it, and labels.
 
-    Depth is 0 where nothing was measured. A pixel's true label is 0 for the table or nothing, k for
-    mesh k - 1. The meshes [m] and the pose obj_from_camera (4, 4) [m] are in one frame. The table
-    is a disc of radius 0.6 m about the origin at the height `table` [m]; None means no table.
-    `noise` is True for the default noise, False for exact depths, the name of a camera, or a
-    `SensorNoise`. `seed` draws the noise.
+    Both images are (480, 640). Depth is 0 where nothing was measured. A pixel's true label is 0 for
+    the table or nothing, k for mesh k - 1. The meshes [m] and the pose obj_from_camera (4, 4) [m]
+    are in one frame. The table is a disc of radius 0.6 m about the origin at the height `table`
+    [m]; None means no table. `noise` is True for the default noise, False for exact depths, the
+    name of a camera, or a `SensorNoise`. `seed` draws the noise.
     """
     pose = check_rigid("camera_pose", camera_pose).double()
     depth = torch.full((HEIGHT, WIDTH), torch.inf, dtype=torch.float64)

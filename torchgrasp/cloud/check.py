@@ -46,7 +46,7 @@ class CloudNumbers:
     equal: float = 1e-6
     """Greatest error of a coordinate that is rounded to such a step, over the step."""
     coarse: float = 0.002
-    """Least step [m] of coordinates that is told: its rounding is as large as a camera's noise."""
+    """Least step [m] of coordinates for a warning: its rounding is as large as a camera's noise."""
     farthest: float = 50.0
     """Greatest distance [m] of a camera; depth images measure no farther, and one in cm is."""
 
@@ -80,7 +80,8 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
     """Return a cloud without duplicate points, which would count as independent measurements.
 
-    Of coincident points the first is kept. Raises the errors of `check_cloud`.
+    Of coincident points the first is kept. Raises the errors of `check_cloud`, as for fewer than 4
+    distinct points or an extent outside [5 mm, 2 m].
     """
     points = _check(cloud)
     rows = _distinct_rows(points)
@@ -100,7 +101,8 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
         voxel: side [m] of the voxels, 0.00001 to 1. Their grid starts at the cloud's least x, y and
             z.
 
-    Raises the errors of `check_cloud`, and `TooFewPoints` if fewer than 4 voxels hold points.
+    Raises the errors of `check_cloud`, as for fewer than 4 distinct points or an extent outside [5
+    mm, 2 m]. Raises `TooFewPoints` if fewer than 4 voxels hold points.
 
     >>> len(voxel_downsample(PointCloud(0.1 * torch.rand(5000, 3)), 0.05)) <= 27
     True
@@ -125,7 +127,8 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
     Each point has a mean distance to its 8 nearest neighbours. The mean distance of an outlier is
     more than 2.5 times (`NEAR.outlier`) the median of all points.
 
-    Raises the errors of `check_cloud`.
+    Raises the errors of `check_cloud`, as for fewer than 4 distinct points or an extent outside [5
+    mm, 2 m].
 
     >>> points = torch.cat([0.1 * torch.rand(500, 3), torch.ones(1, 3)])
     >>> bool(remove_outliers(PointCloud(points)).points.max() < 0.2)
@@ -177,7 +180,8 @@ def coordinate_step(points: Points) -> float:
     """Return the step [m] to which all coordinates (n, 3) [m] are rounded. Return 0 for a step
     below 2 mm (`CLOUD.coarse`), or for fewer than 100 points (`FEW_POINTS`).
 
-    Numbers in float32 have large steps far from the origin, and texts of two decimals have others.
+    Float32 numbers have large steps far from the origin. Text files of two decimals have steps of
+    10 mm.
     """
     found = points.detach().double().cpu()
     if len(found) < FEW_POINTS:

@@ -58,7 +58,7 @@ class DepthNumbers:
     even: float = 1e-3
     """Greatest error of a depth that is a whole number of steps, over the step."""
     coarse: float = 0.005
-    """Least step [m] of the depths that is told: it is larger than edges of things and noise."""
+    """Least step [m] of the depths for a warning: it is larger than edges of things and noise."""
     several: float = 0.05
     """Least share of a mask's pixels with one number that may be another object."""
     viewed: int = 5000
@@ -106,7 +106,10 @@ def cloud_from_depth(
             wrong pose: with a `mask`, a table in the image must face up.
 
     A polynomial distortion of a raw image (plumb_bob, rational_polynomial) is removed: each pixel's
-    ray is undistorted. `MendedInput` then warns that the distortion was removed.
+    ray is undistorted. `MendedInput` then warns that the distortion was removed. A `CloudWarning`
+    is given for a camera more than 10 m from the origin. It is also given for depths in steps of 5
+    mm or more, and for depths scaled to 0..1. Masks with several numbers and pixels far from square
+    raise it, too.
 
     Raises:
         BadArgument: depth that is negative or of another unit.
@@ -198,8 +201,9 @@ def read_depth(
     """Check the arguments of `cloud_from_depth`; return depth, intrinsics, mask and distortion.
 
     The depth (h, w) is in metres, 0 where nothing was measured. The intrinsics (3, 3) are in
-    pixels. The mask (h, w) and the distortion are None without one. Raises `BadArgument` for what
-    `cloud_from_depth` refuses.
+    pixels. The mask (h, w) and the distortion are None if not given. Raises `BadArgument` for
+    arguments of a wrong type, size or unit. A `CloudWarning` is given for a mask of several
+    numbers, depths scaled to 0..1, or pixels far from square.
     """
     k, stated, scale, lens = parse_intrinsics(intrinsics)
     image = as_tensor("depth", depth)
@@ -283,9 +287,10 @@ def _in_metres(image: Tensor, unit: float | None) -> Image:
 
 
 def tell_step(depth: Image) -> tuple[str, ...]:
-    """Return one note if all depths [m] of an image are whole numbers of a large step, else none.
+    """Return one note, a sentence, if an image's depths [m] have steps of 5 mm or more, else none.
 
-    Depths of 0 are not measured.
+    Such depths are whole numbers of steps from the least one. The bound is `DEPTH.coarse`. Depths
+    of 0 were not measured, and do not count.
     """
     step = _step_of(depth[depth > 0])
     if step < DEPTH.coarse:

@@ -63,8 +63,8 @@ class IntrinsicsNumbers:
     unequal: float = 0.05
     """Greatest difference of fx and fy, over fy, of four numbers in their right order."""
     uneven: float = 0.12
-    """Difference of fx and fy, over fy, that is told: pixels of old cameras differ by less, images
-    that were resized to other proportions by more.
+    """Difference of fx and fy, over fy, from which a warning is given. Pixels of old cameras differ
+    by less, images that were resized to other proportions by more.
     """
     beside: float = 0.1
     """Greatest shift of the principal point from the middle in four such numbers. It is a share of
@@ -132,11 +132,13 @@ class Written(NamedTuple):
 def parse_intrinsics(
     value: object,
 ) -> tuple[Matrix, list[float] | None, float | None, Lens | None]:
-    """Return the matrix (3, 3) [pixels] of intrinsics in any form that `cloud_from_depth` takes.
+    """Return the matrix (3, 3) [pixels] of a camera's intrinsics, and what else describes the
+    camera.
 
-    Second is the [width, height] of the image [pixels]. Third are the metres of one count of the
-    depth, and fourth is the distortion. Each is None if it is not stated. Raises `BadArgument` for
-    anything else.
+    `value` has any form that `cloud_from_depth` takes: a matrix, four numbers, a dict or a driver's
+    object. Second is the [width, height] of the image [pixels]. Third are the metres of one count
+    of the depth, and fourth is the distortion. Each is None if it is not stated. Raises
+    `BadArgument` for anything else.
     """
     table, size, scale, window, lens = _read_written(value)
     k = as_tensor("intrinsics", table)
@@ -299,9 +301,9 @@ def _is_table(value: object) -> bool:
 def check_intrinsics(k: Matrix, stated: list[float] | None, size: Sequence[int]) -> None:
     """Raise `BadArgument` for intrinsics that no camera has, or that are those of another image.
 
-    Pixels that are not square raise a `CloudWarning`. `k` is the matrix [pixels]; `stated` is the
-    [width, height] that came with it, or None. The image has the `size` (h, w) [pixels], and may be
-    a crop.
+    A `CloudWarning` is given if fx and fy differ by over 12 % (`LIMITS.uneven`). `k` is the matrix
+    [pixels]; `stated` is the [width, height] that came with it, or None. The image has the `size`
+    (h, w) [pixels], and may be a crop.
     """
     height, width = size
     (fx, _, cx), (_, fy, cy) = k[:2].tolist()

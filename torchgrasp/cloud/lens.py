@@ -52,7 +52,7 @@ LENS = LensNumbers()
 class Lens(NamedTuple):
     """The polynomial distortion of a lens (OpenCV's rational model).
 
-    `coefficients` are the eight numbers, without unit, that `NAMES` lists.
+    `coefficients` are OpenCV's k1, k2, p1, p2, k3, k4, k5 and k6, in this order, without unit.
     """
 
     coefficients: tuple[float, ...]
@@ -60,10 +60,12 @@ class Lens(NamedTuple):
     def distort(
         self, rays: Float[Tensor, "n 2"]
     ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"]]:
-        """Return where bent rays (x, y, 1) meet the image plane at depth 1, then the derivatives by
-        x and y.
+        """Return where n rays (x, y, 1) meet the image plane at depth 1 once the lens has bent
+        them.
 
-        `rays` holds x and y of n rays before the lens bends them (no unit).
+        `rays` (n, 2) holds x and y of the rays before the lens bends them (no unit). The second
+        result holds the derivatives (n, 2, 2) of the first one. Entry (i, j) is that of coordinate
+        i by ray coordinate j.
         """
         k1, k2, p1, p2, k3, k4, k5, k6 = self.coefficients
         x, y = rays.unbind(-1)
@@ -83,9 +85,11 @@ class Lens(NamedTuple):
         return torch.stack([u, v], -1), jacobian
 
     def rays(self, k: Float[Tensor, "3 3"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-        """Return x and y of the ray (x, y, 1) of each pixel (column, row), given intrinsics [px].
+        """Return x and y of each pixel's ray (x, y, 1), before the lens bends it.
 
-        Raises `BadArgument` if a pixel lies beyond what the polynomial maps one to one.
+        `pixels` (n, 2) are column and row; the result (n, 2) has no unit. `k` is the matrix of the
+        intrinsics [px]. Raises `BadArgument` if a pixel lies where the polynomial is not one to
+        one.
         """
         focal = torch.diagonal(k)[:2]
         seen = (pixels - k[:2, 2]) / focal
@@ -109,7 +113,7 @@ class Lens(NamedTuple):
 
 
 def describe(coefficients: object) -> str:
-    """Return coefficients as short text."""
+    """Return the coefficients of a distortion as short text."""
     return str(coefficients)[:SHOWN_LETTERS]
 
 
@@ -124,10 +128,11 @@ def numbers_of(value: object) -> list[float]:
 
 
 def read_lens(named: Mapping[str, Any]) -> Lens | None:
-    """Return the distortion in the named values of a camera; None if it moves no pixel.
+    """Return the distortion among a camera's values, given by name; None if there is hardly any.
 
-    Names are in lower case. Raises `BadArgument` for a model that is no rational polynomial, such
-    as a fisheye's. Raises it also for coefficients that are no such model's.
+    Names are in lower case. There is hardly any if no coefficient exceeds 0.001 (`LENS.straight`).
+    Raises `BadArgument` for a model that is no rational polynomial, such as a fisheye's. Raises it
+    also for coefficients that are no such model's.
     """
     lists = [named[name] for name in LISTS if named.get(name) is not None]
     found = {name: named[name] for name in (*NAMES, *OFF_CENTRE) if named.get(name) is not None}

@@ -58,9 +58,9 @@ def nearest(
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
     """Return the distances and the indices of the k nearest points to each of m points.
 
-    Those are the points (n, 3) with the indices `rows`, by default all. Distances have the unit of
-    `points` and ascend; each point itself comes first. A cloud of fewer than k points gives fewer
-    columns.
+    The m points are those of `points` (n, 3) with the indices `rows`, by default all. The results
+    are distances to `points`, and indices into them. Distances have the unit of `points` and
+    ascend; each point itself comes first. A cloud of fewer than k points gives fewer columns.
     """
     array = points.detach().cpu().numpy()
     asked = array if rows is None else array[rows.cpu().numpy()]
@@ -70,14 +70,19 @@ def nearest(
 
 
 def usual_spacing(points: Points) -> float:
-    """Return the usual distance between neighbours, in the unit of the points (n, 3)."""
+    """Return the median, over the points (n, 3), of the mean distance to the 8 nearest neighbours.
+
+    It has the unit of the points.
+    """
     return float(nearest(points, NEAR.spacing)[0][:, 1:].mean(-1).median())
 
 
 def find_inliers(points: Points, rows: Int[Tensor, "m"] | None = None) -> Bool[Tensor, "m"]:
-    """Return a mask of m points that are not outliers, as `remove_outliers` defines them.
+    """Return a mask of those of m points that are not outliers, such as flying pixels.
 
-    Those are the points (n, 3) with the indices `rows`, by default all.
+    The m points are those of `points` (n, 3) with the indices `rows`, by default all. Each has a
+    mean distance to its 8 nearest neighbours. That of an outlier is more than 2.5 times
+    (`NEAR.outlier`) the median one.
     """
     spacing = nearest(points, NEAR.spacing, rows)[0][:, 1:].mean(-1)
     return spacing <= NEAR.outlier * spacing.median()
@@ -85,37 +90,53 @@ def find_inliers(points: Points, rows: Int[Tensor, "m"] | None = None) -> Bool[T
 
 @dataclasses.dataclass(frozen=True)
 class Neighbours:
-    """What the neighbours of a cloud's points tell, each found once and then kept.
+    """Inliers, local planes and local quadrics of a cloud, each found once and then kept.
 
-    Lengths have the unit of the n points.
+    They follow from the nearest neighbours of each of n points. Lengths have the unit of the
+    points.
     """
 
     points: Points
 
     @cached_property
     def inliers(self) -> Bool[Tensor, "n"]:
-        """A mask of the points that are not outliers, as `remove_outliers` defines them."""
+        """A mask of the points that are not outliers, such as flying pixels.
+
+        Each point has a mean distance to its 8 nearest neighbours. That of an outlier is more than
+        2.5 times (`NEAR.outlier`) the median one.
+        """
         return find_inliers(self.points)
 
     @cached_property
     def clean(self) -> "Neighbours":
-        """The neighbours among the m inliers alone."""
+        """The `Neighbours` of the m inliers alone, whose nearest neighbours are inliers, too."""
         return Neighbours(self.points[self.inliers])
 
     @cached_property
     def near(self) -> tuple[Float[Tensor, "n k"], Int[Tensor, "n k"]]:
-        """Distances and indices of the neighbours to which planes and quadrics are fitted."""
+        """Distances to the k = 30 nearest points (`NEAR.quadric`) of each of n points, and their
+        indices.
+
+        They ascend, and each point itself comes first. Planes and quadrics are fitted to them.
+        """
         return nearest(self.points, NEAR.quadric)
 
     @cached_property
     def planes(self) -> tuple[Points, Float[Tensor, "n 3 3"]]:
-        """Variances and principal axes of these neighbours, as `_principal_axes` returns them."""
+        """Variances (n, 3) of each point's neighbours (`near`) along their principal axes, and the
+        axes.
+
+        Variances ascend, and have the squared unit of the points. The axes are unit vectors, the
+        columns of (n, 3, 3). The first is the normal, of either sign, of the plane fitted to the
+        neighbours.
+        """
         distance, index = self.near
         return _principal_axes(self.points[index], _weigh(distance))
 
     @cached_property
     def quadrics(self) -> tuple[Points, Points, Float[Tensor, "n"]]:
-        """A quadric around each of n points: the moved point, the unit normal and the error.
+        """A quadric surface fitted around each of n points: the moved point, the unit normal and
+        the error.
 
         The point (n, 3) is moved onto the quadric. The normal (n, 3), of either sign, is that of
         the quadric there. The rms error has the unit of `points`. Planes would move the points of a
@@ -136,8 +157,12 @@ class Neighbours:
 
     @cached_property
     def flat(self) -> bool:
-        """Whether the cloud is no thicker than its noise: twice the error of quadrics around the
-        points.
+        """Whether the cloud is flat: no thicker than its noise, which is twice the error of its
+        quadrics.
+
+        The thickness is the standard deviation along the principal axis of least spread. The error
+        is the median rms error of the quadrics (`quadrics`). A cloud thinner than 0.001
+        (`NEAR.thin`) of its length is flat, too.
         """
         some = self
         if len(self.points) > NEAR.flat:
@@ -159,8 +184,8 @@ def fit_local_planes(
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
     """Fit a plane around each of m points; return unit normals of either sign, and rms errors.
 
-    Those are the points (n, 3) with the indices `rows`, by default all. The errors have the unit of
-    `points`.
+    The m points are those of `points` (n, 3) with the indices `rows`, by default all. The errors
+    have the unit of `points`.
     """
     distance, index = nearest(points, NEAR.plane, rows)
     mean_squares, axes = _principal_axes(points[index], _weigh(distance))

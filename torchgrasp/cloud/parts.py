@@ -76,8 +76,9 @@ def label_bodies(points: Points, gap: float = PARTS.gap) -> Int[Tensor, "n"]:
 def find_second_body(points: Points, up: Vector, spacing: float) -> Bool[Tensor, "n"] | None:
     """Return a mask of the points of a second body on the same ground; None if there is none.
 
-    The points (n, 3) are in metres, and `up` is the unit vector that points up. `spacing` [m] is
-    the distance between neighbouring points.
+    Bodies are more than 40 mm (`PARTS.gap`), and 4 spacings, apart. The second one holds at least
+    10 % of the points (`PARTS.share`). The points (n, 3) are in metres, and `up` is the unit vector
+    that points up. `spacing` [m] is the distance between neighbouring points.
     """
     label = label_bodies(points, max(PARTS.gap, PARTS.spacings * spacing))
     height = points @ up
@@ -156,9 +157,9 @@ def cut_object(
 def cut_exact_table(cloud: PointCloud, up: Vector) -> tuple[PointCloud, Plane | None]:
     """Return a cloud without the points of a table that has no noise, and the plane of the table.
 
-    Only simulated clouds have such a table; without noise, no point of the object's foot is cut off
-    with it. Without one, the cloud is returned itself, and None. `up` is the unit vector that
-    points up.
+    Such a table is that of a simulated cloud. Its points are cut off in so thin a layer that the
+    object's foot stays. If there is no such table, the cloud itself and None are returned. `up` is
+    the unit vector that points up. Cloud, plane and `up` are in one frame.
     """
     points = cloud.points.double()
     support = find_ground(points, cloud.viewpoint, up.to(points))
@@ -182,9 +183,10 @@ def find_ground(
 ) -> SupportPlane | None:
     """Return the plane on which objects stand; None if there is none.
 
-    It is nearly level and at least `level_width` [m] wide, else any plane on which the cameras look
-    down. The points (n, 3) are in metres. `eye` holds the camera's position [m], or that of each
-    point; None if it is unknown. `up` is the unit vector that points up.
+    A nearly level plane at least `level_width` [m] wide is sought first. If there is none, any
+    plane counts on which the cameras look down. All are in one frame. The points (n, 3) are in
+    metres. `eye` holds the camera's position [m], or that of each point; None if it is unknown.
+    `up` is the unit vector that points up.
     """
     middle = None if eye is None else eye.reshape(-1, 3).mean(0)
     kinds = (

@@ -32,7 +32,8 @@ class PixelNumbers:
     directions: int = 800
     """Directions over a whole sphere that are tried first; they are about 7 degrees apart."""
     above: float = 0.1
-    """Least cosine between a direction and the one of the side: a camera is above the support."""
+    """Least cosine between the direction of a camera and the upward one: it is above the support.
+    """
     usual: float = 0.6
     """Usual distance [m] of a camera, at which the search begins."""
     rare: float = 0.5
@@ -67,10 +68,10 @@ PIXELS = PixelNumbers()
 def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None:
     """Return the camera position [m] from which points (n, 3) [m] form a regular lattice of pixels.
 
-    It is None if there is no such place. A camera on the opposite side sees nearly the same
-    lattice. So only cameras above are tried, in the direction `up`. If it is None, those on the
-    side to which the surface bulges are tried. The origin, the camera of a cloud in its camera's
-    frame, is tried first.
+    It is None if there is no such position, or for fewer than 100 points (`PIXELS.least`). From the
+    opposite side, the points form nearly the same lattice. So only cameras on the side of the
+    vector `up` are tried. If it is None, the side is the one to which the surface bulges. The
+    origin is tried first: there is the camera if the points are in its frame.
     """
     if len(points) < PIXELS.least:
         return None
@@ -101,9 +102,12 @@ def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None
 def irregularity(
     probes: Float[Tensor, "m 3"], near: Float[Tensor, "m k 3"], eyes: Float[Tensor, "c 3"]
 ) -> Float[Tensor, "c"]:
-    """Return how irregular the pixels of c cameras are, as in `PixelNumbers`.
+    """Return how irregular the pixels are as seen by cameras at each of c positions `eyes` [m] (no
+    unit).
 
-    `probes` are m points [m], and `near` the k nearest points of each.
+    It is the mean deviation of the angles between neighbouring pixels from their median, over this
+    median. So it is about 0 for a regular lattice. `probes` are m points [m], and `near` the k
+    nearest points of each.
     """
     found = list[Tensor]()
     for some in eyes.split(PIXELS.block):

@@ -53,8 +53,8 @@ class PoseNumbers:
     farthest: float = 100.0
     """A camera farther from the origin [m] has a pose that is not in metres."""
     farthest_table: float = 10.0
-    """A table farther from the origin along its normal [m] has a pose that is not in metres. Of a
-    camera so far off, a warning tells.
+    """A table farther from the origin along its normal [m] has a pose that is not in metres. A
+    camera so far off gives a note.
     """
     millimetres: float = 200.0
     """A position that is too far is in mm if a coordinate is above this, else in cm."""
@@ -79,10 +79,10 @@ class PoseNumbers:
     tilt less than a third as much as now.
     """
     told: float = 5.0
-    """Tilt of a table [deg] from which a note tells it."""
+    """Least tilt of a table [deg] for a note."""
     upturned: float = 0.5
-    """Part of a table's normal along y of the camera's own frame, which points down. Above this,
-    the camera hangs upside down. With such a part along x it lies on its side.
+    """Component of a table's normal along y of the camera's own frame, which points down. Above
+    this, the camera hangs upside down. With such a component along x it lies on its side.
     """
     sloped: float = 15.0
     """A table tilted by less than this [deg], or as far from upside down, may be a slope."""
@@ -208,9 +208,10 @@ def _describe_fault(pose: Transform) -> str:
 
 
 def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
-    """Return the pose obj_from_camera (4, 4) [m] of a camera in float64, after checks.
+    """Return the given pose obj_from_camera (4, 4) [m] of a camera in float64, after checks.
 
-    Raises `BadArgument` for a pose that is not rigid, or more than 100 m from the origin.
+    A rotation within 0.1 degrees of a rigid one is replaced by it, and `MendedInput` warns. Raises
+    `BadArgument` for another pose that is not rigid, or more than 100 m from the origin.
     """
     try:
         read = torch.as_tensor(pose, dtype=torch.float64)
@@ -224,9 +225,9 @@ def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
 
 
 def tell_far(pose: Transform) -> tuple[str, ...]:
-    """Return one note if a camera is very far from its frame's origin, else none.
+    """Return one note, a sentence, if a camera is over 10 m from its frame's origin, else none.
 
-    Its pose may then be in cm.
+    Its pose obj_from_camera (4, 4) may then be in cm. The bound is `POSE.farthest_table`.
     """
     distance = float(norm(pose[:3, 3]))
     if distance <= POSE.farthest_table:
@@ -251,8 +252,8 @@ def _check_distance(pose: Transform, distance: float, most: float, what: str) ->
 def read_pose(name: str, path: Path | str) -> Transform:
     """Return the rigid transform (4, 4) [m] in a .npy file, or in a .txt file with four lines.
 
-    Each line has four numbers. Raises `BadArgument`, which calls the argument `name`, for a file of
-    another format, or a malformed one.
+    Each line has four numbers. Raises `BadArgument`, which calls the argument `name`, for a
+    malformed file, another format, or a transform that is not rigid.
     """
     data, suffix = read_suffixed(name, path, (".npy", ".txt"))
     try:
@@ -275,11 +276,11 @@ def find_plausible(
     """Return the planes on which objects may stand, the most plausible first.
 
     `points` (n, 3) [m] and the `table` are in the frame to which the `pose` leads. The table is a
-    plane or a height z [m]. `up` is the direction against gravity there. With None, planes may face
-    any way. But level ones, as z of a given pose says, come before walls. `known_unit` is whether
-    the user gave the unit of the depth. Supports that carry the `target` come first. Raises
-    `BadArgument` for a pose or a unit that the view contradicts, and `NoSupport` if there is no
-    plane.
+    plane or a height z [m]. With None, planes are sought in the points. `up` is the direction
+    against gravity there. With None, planes may face any way. But unless the frame is the camera's,
+    walls are left out if a plane is level. `known_unit` is whether the user gave the unit of the
+    depth. Supports that carry the `target` come first. Raises `BadArgument` for a pose or a unit
+    that the view contradicts, and `NoSupport` if there is no plane.
     """
     eye = pose[:3, 3]
     image_up = -pose[:3, 1] if up is None and _is_own(pose) else None
@@ -402,10 +403,11 @@ def _check_normals(supports: tuple[SupportPlane, ...], pose: Transform, up: obje
 
 
 def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
-    """Return one note if a table is tilted from z of the frame to which `pose` leads, else none.
+    """Return one note, a sentence, if a table is tilted by 5 degrees or more from z, else none.
 
-    A camera's own frame has no such z. There, a note tells of a camera that hangs upside down.
-    `plane` is the table in the frame.
+    The bound is `POSE.told`. z is that of the frame to which `pose` leads, and `plane` is the table
+    in this frame. In the camera's own frame z need not be up. There, a note is returned if the
+    camera hangs upside down or lies on its side.
     """
     if _is_own(pose):
         right, down, _ = plane.normal.tolist()
@@ -444,9 +446,11 @@ def _check_given_table(points: Points, plane: Plane) -> None:
 
 
 def tell_layer(points: Points, plane: Plane) -> tuple[str, ...]:
-    """Return one note if many points lie in a layer that is parallel to a given table, else none.
+    """Return one note, a sentence, if many points lie in a layer parallel to a given table, else
+    none.
 
-    The layer is perhaps the true table. `points` (n, 3) [m] and the `plane` are in one frame.
+    The layer is perhaps the true table. It is 10 mm thick and holds at least 20 % of the points
+    (`LAYER.share`). `points` (n, 3) [m] and the `plane` are in one frame.
     """
     height = plane.height(points[:: 1 + len(points) // POSE.drawn].double().cpu())
     near = height[(height > -LAYER.above) & (height < LAYER.below)]
@@ -472,9 +476,9 @@ def tell_layer(points: Points, plane: Plane) -> tuple[str, ...]:
 def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -> tuple[str, ...]:
     """Raise `BadArgument` for a unit of the depth that makes objects too large or small for a hand.
 
-    Returns one note if the camera is high, or near to tiny objects, else none. `labels` (n,) holds
-    the object of each of the `points` (n, 3) [m], 0 for none; `plane` is the table. The `pose`
-    leads to their frame.
+    Returns one note, a sentence, if the camera is over 1 m high (`SIZES.high`), else none. A camera
+    near to tiny objects gives one, too. `labels` (n,) holds the object of each of the `points` (n,
+    3) [m], 0 for none; `plane` is the table. The `pose` leads to their frame.
     """
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
     large_enough = [part for part in parts if len(part) >= SIZES.points]
@@ -499,7 +503,8 @@ def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -
 
 
 def tell_furniture(points: Points, labels: Tensor) -> tuple[str, ...]:
-    """Return one note if an object is as long as furniture, else none.
+    """Return one note, a sentence, if an object is at least 0.6 m long (`SIZES.furniture`), else
+    none.
 
     Then a wall or the floor may have been taken for the table. `labels` (n,) holds the object of
     each of the `points` (n, 3) [m], 0 for none.

@@ -118,9 +118,11 @@ class PreparedCloud(Value):
     normals: Points  # (n, 3), outward unit normals at `points`
     # position of the camera [m] of all `points`, or of each; None if unknown
     viewpoint: Float[Tensor, "*views 3"] | None
-    # inward unit normals of the four sides of the camera's view, or of each point's, if known
+    # inward unit normals of the four sides of the camera's view, or of each point's camera; None if
+    # unknown
     frustum: Float[Tensor, "*views 4 3"] | None
-    pose_error: Float[Tensor, "n"] | None  # as in `PointCloud` [m], of `points`
+    # standard deviation [m] of each of `points` because of an uncertain pose; None if it is exact
+    pose_error: Float[Tensor, "n"] | None
     estimated: bool = False  # whether the viewpoint was estimated, not given
 
     @property
@@ -140,17 +142,28 @@ def prepare_cloud(
 ) -> PreparedCloud:
     """Return the checked cloud, and the points and outward unit normals to which a shape is fitted.
 
-    `generator` draws at most 2000 of the points. Missing normals are fitted. So are normals of
-    random signs, with which a single view would look like a whole surface. With `clean`, outliers
-    are removed, and the other points are moved onto quadrics fitted around them. All normals are
-    fitted anew. Also with `clean`, a viewpoint that too few given normals face counts as missing.
-    If these are the normals of one side, `NoEffect` warns of it. Vectors across the surface, which
-    are no normals, raise a `CloudWarning`. With `clean`, a missing viewpoint is that of
-    `find_pixel_camera`, if its pixels show it. Else, and where normals are fitted, it is estimated
-    by `guess_viewpoint`. `up` is the upward direction, or None. `neighbours` are those of the
-    points in float64, if they are known. Raises the errors of `check_cloud`. Raises `BadArgument`
-    for more than 16 cameras or normals that point away from the camera. Raises `TooFewPoints` for a
-    view of fewer than 10 points.
+    Missing normals are fitted. So are normals of random signs, with which a single view would look
+    like a whole surface. Fitted normals face the viewpoint; a missing one is estimated for them.
+
+    With `clean`, outliers are removed, and the other points are moved onto quadrics fitted around
+    them. All normals are fitted anew. A viewpoint that too few given normals face counts as
+    missing. A missing viewpoint is found from the lattice of the camera's pixels, if the points
+    show one. Otherwise it is estimated.
+
+    Args:
+        cloud: points [m] of one object.
+        generator: draws the at most 2000 points to which a shape is fitted.
+        clean: whether the cloud is cleaned, as above.
+        up: upward direction (3,); None if unknown.
+        neighbours: the neighbours of the points in float64; None if they are not yet known.
+
+    `NoEffect` warns if given normals show one side, but do not face the viewpoint. A `CloudWarning`
+    is given for vectors across the surface, which are no normals, and for normals that point
+    inward.
+
+    Raises the errors of `check_cloud`, as for fewer than 4 distinct points or an extent outside
+    [5 mm, 2 m]. Raises `BadArgument` for more than 16 cameras or normals that point away from the
+    camera. Raises `TooFewPoints` for a view of fewer than 10 points.
     """
     distinct = remove_duplicates(cloud)
     if neighbours is None or len(distinct) < len(cloud):
@@ -232,7 +245,8 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
     It points towards the viewpoint. Without a viewpoint, it points to the side of the given normal.
     Without both, the viewpoint is estimated, and the result has this viewpoint.
 
-    Raises the errors of `check_cloud`.
+    Raises the errors of `check_cloud`, as for fewer than 4 distinct points or an extent outside [5
+    mm, 2 m].
 
     >>> cloud = PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))
     >>> estimate_normals(cloud).normals.shape
@@ -246,7 +260,8 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 def clean_cloud(cloud: PointCloud) -> PointCloud:
     """Return a cloud without duplicates and outliers, moved onto quadrics around the points.
 
-    Its normals are outward unit normals of the quadrics. Raises the errors of `check_cloud`.
+    Its normals are outward unit normals of the quadrics. Raises the errors of `check_cloud`, as for
+    fewer than 4 distinct points or an extent outside [5 mm, 2 m].
     """
     cloud = remove_duplicates(cloud)
     return _fit_normals(cloud, Neighbours(cloud.points.double()), clean=True)
@@ -282,7 +297,7 @@ def _fit_normals(
 
 
 def compare_normals(points: Points, normals: Points) -> NormalCheck:
-    """Return how well normals agree among neighbouring points.
+    """Return how well normals agree with the normals of neighbouring points.
 
     `points` (n, 3) are in metres; `normals` (n, 3) may have any length.
     """
@@ -307,7 +322,8 @@ def compare_normals(points: Points, normals: Points) -> NormalCheck:
 def lie_across(points: Points, normals: Points) -> bool:
     """Return whether vectors (n, 3) lie across the surface of their `points` (n, 3) [m].
 
-    Then they are no normals, such as colours, or one direction for all points.
+    Such vectors are no normals, but colours, or one direction for all points. Their median |cosine|
+    with normals of fitted planes is below 0.7 (`NORMALS.across`).
     """
     if len(points) < NEAR.plane:
         return False  # too few for planes
@@ -325,9 +341,9 @@ def lie_across(points: Points, normals: Points) -> bool:
 def point_inward(points: Points, normals: Points) -> bool:
     """Return whether normals (n, 3) point to the middle of their `points` (n, 3) [m].
 
-    Then the surface is inside out, or hollow. For outward normals, the sum of (p - c) . n is that
-    of the divergence theorem. It is three times the volume of a closed surface, and positive for a
-    view of a surface that bulges.
+    Then the surface is inside out, or hollow. They do if the sum of (p - c) . n is clearly
+    negative, for points p with the mean c and normals n. By the divergence theorem, outward normals
+    of a closed surface give a positive sum. So do those of a view of a surface that bulges.
     """
     away = points - points.mean(0)
     outward = float((away * unit_of_any(normals)).sum())
@@ -373,7 +389,8 @@ def merge_clouds(
         BadArgument: views that contradict each other by more than about three times their noise. A
             pose is wrong, or the object moved.
 
-    The views and the result may raise the errors of `check_cloud`.
+    The views and the result may raise the errors of `check_cloud`, as for an extent outside [5 mm,
+    2 m].
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> len(merge_clouds([view, view], [torch.eye(4), torch.eye(4)]))

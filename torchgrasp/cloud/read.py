@@ -59,15 +59,16 @@ class ReadNumbers:
     across: float = 0.1
     """Quantile of the cosines with fitted planes that must be as large if all normals are alike."""
     searched: int = 1000
-    """Rows, about, among which a place of missing pixels is sought."""
+    """Rows, about, among which a point that stands for missing pixels is sought."""
     fewest: int = 100
-    """Fewest rows that can have such a place."""
+    """Fewest rows that can have such a point."""
     repeated: float = 0.05
-    """Least share of these rows at such a place."""
+    """Least share of these rows that hold such a point."""
     usual: float = 0.9
-    """Quantile of the rows at a place that counts as usual: clouds may hold copies of points."""
+    """Quantile of the numbers of equal rows that counts as usual: clouds may hold copies of points.
+    """
     more: float = 5.0
-    """Least number of rows at such a place, over the usual one."""
+    """Least number of rows with such a point, over the usual number of equal rows."""
 
 
 READ = ReadNumbers()
@@ -290,9 +291,10 @@ def make_cloud(
 ) -> CloudFile:
     """Return a `CloudFile` made of arrays by name, without points that were not measured.
 
-    The arrays are in units of `scale` metres; their names are those of a file's, as "points".
-    `viewpoint` [m] replaces that of the arrays. `source` is the file in errors. Raises
-    `CloudFileError`, `BadArgument` or `TooFewPoints` for arrays that are no cloud.
+    The arrays are in units of `scale` metres. Their names are "points", "normals", "viewpoint" and
+    so on, as in a .npz file of `read_cloud`. `viewpoint` [m] replaces that of the arrays. `source`
+    is the file in errors. Raises `CloudFileError`, `BadArgument` or `TooFewPoints` for arrays that
+    are no cloud.
     """
     notes: list[str] = []
     if "columns" in arrays:

@@ -51,12 +51,14 @@ class DepthShot(NamedTuple):
 
 
 def shoot_depth(serial: str | None = None, numbers: LiveCameraNumbers = SHOT) -> DepthShot:
-    """Return the median of some depth frames of a connected RealSense, which stands still.
+    """Return the median of 9 depth frames (`SHOT.frames`) of a connected RealSense, which stands
+    still.
 
-    The mode is the camera's default. `serial` is the number of the camera; None means the only one.
-    Raises `MissingExtra` without pyrealsense2, and `BadArgument` if it cannot be loaded. The same
-    is raised if no camera is connected, or if none or several fit. It is raised, too, if a frame
-    does not come, or if the view moves.
+    The resolution is the camera's default. `serial` is the camera's serial number; None means the
+    only camera. `numbers` count the frames and bound the waits. Raises `MissingExtra` without the
+    package pyrealsense2. Raises `BadArgument` if this package cannot be loaded, or if not exactly
+    one camera fits. It is raised, too, if the camera does not start, a frame does not come, or the
+    view moves.
     """
     sdk = import_sdk()
     device = _choose(sdk, list_cameras(sdk), serial)

@@ -176,10 +176,10 @@ def compare_views(views: Sequence[PointCloud]) -> list[float]:
 def compare_with(seen: PointCloud, view: PointCloud) -> float:
     """Return the standard deviation [m] of a view's pose, estimated from what was seen before.
 
-    It is 0 if noise explains the distance of the two, or if they overlap too little. Both have
-    normals and are in one frame [m]. Raises `BadArgument` for a view that is too far off for its
-    noise. The bounds on its distance and its shift are `VIEWS.refused` and `VIEWS.shifted`,
-    multiples of the noise. A lesser distance that noise does not explain raises the warning
+    It is 0 if noise explains the distance of `seen` and `view`, or if they overlap too little. Both
+    clouds have normals and are in one frame [m]. Raises `BadArgument` for a view that is too far
+    off for its noise. Too far is a distance of 2.5 times the noise (`VIEWS.refused`), or a shift of
+    3 times (`VIEWS.shifted`). A lesser distance that noise does not explain raises the warning
     `MendedInput`.
     """
     one = _ViewSurface(seen)
@@ -210,9 +210,10 @@ def align_views(views: Sequence[PointCloud]) -> list[tuple[Float[Tensor, "4 4"],
     """Return a motion new_from_old (4, 4) [m] of each view, after which the views agree best.
     Return also its standard deviation [m] along the surface's normals.
 
-    The views [m] have normals and are in one frame. The first stays; each other one is moved onto
-    those that are placed. A motion that noise does not explain raises the warning `MendedInput`;
-    for other motions the view stays. Raises `BadArgument` for a motion beyond 50 mm or 20 degrees.
+    The views [m] have normals and are in one frame. The first stays. Each other one is moved onto
+    the views that are already placed. A motion that noise does not explain raises the warning
+    `MendedInput`; for other motions the view stays. Raises `BadArgument` for a motion beyond 50 mm
+    or 20 degrees.
     """
     placed = [views[0]]
     motions = [(torch.eye(4, dtype=torch.float64, device="cpu"), 0.0)] * len(views)

@@ -33,7 +33,7 @@ HEADERS = {
 def parse_npy(data: bytes) -> np.ndarray:
     """Return the array of a .npy file, given its bytes.
 
-    Raises `Malformed` for objects, and for fewer bytes than the header states.
+    Raises `Malformed` for an array of Python objects, and for fewer bytes than the header states.
     """
     if not data.startswith(b"\x93NUMPY"):
         raise Malformed("no header of an .npy file")
@@ -77,11 +77,12 @@ def unread_arrays(data: bytes, known: Sequence[str]) -> list[str]:
 def read_image_file(name: str, path: Path | str) -> Any:
     """Return the array in a file of a depth image, or of masks.
 
-    Formats are .npy, .npz, .png and .tiff; also .exr for depth, and .json for masks. The argument
-    `name` "depth" has one channel, and is the array `depth` of a .npz file. Other arrays raise the
-    warning `NoEffect`. The argument "mask" may be a picture or several masks, in each form that
-    `torchgrasp.scene.masks.read_labels` takes. Raises `BadArgument` for a file of another format,
-    or a malformed one.
+    `name` is the argument that the file is for, "depth" or "mask", and stands in errors. Formats
+    are .npy, .npz, .png and .tiff; also .exr for depth, and .json for masks. A depth image has one
+    channel, and is the array `depth` of a .npz file. Other arrays of this file raise the warning
+    `NoEffect`. Masks may be a picture or several masks, in each form that
+    `torchgrasp.scene.masks.read_labels` takes. Raises `BadArgument` for a file that is missing or
+    malformed, or of another format.
     """
     masks = name == "mask"
     data, suffix = read_suffixed(
@@ -112,7 +113,8 @@ def read_image_file(name: str, path: Path | str) -> Any:
 def parse_json(data: bytes) -> Any:
     """Return the content of a JSON file, given its bytes.
 
-    Raises `Malformed` if there are more than `JSON_BYTES`, and `ValueError` if they are no JSON.
+    Raises `Malformed` for more than 32 MiB (`JSON_BYTES`), and `ValueError` for bytes that are no
+    JSON.
     """
     if len(data) > JSON_BYTES:
         raise Malformed(f"{len(data)} bytes")
@@ -120,7 +122,8 @@ def parse_json(data: bytes) -> Any:
 
 
 def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
-    """Return the intrinsics in a .json, .yaml, .npy or .txt file, as `cloud_from_depth` takes them.
+    """Return the content of a .json, .yaml, .npy or .txt file of intrinsics, for
+    `cloud_from_depth`.
 
     BOP's scene_camera.json holds an entry for each image; `image` is its number as text, "" for
     other files. Errors call the argument `name`. Raises `BadArgument` for a file of another format,
@@ -148,8 +151,8 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
 def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tuple[bytes, str]:
     """Return the bytes and the lower-case suffix of a file.
 
-    Raises `BadArgument`, which calls the argument `name`, for a file that is missing or too large.
-    Raises it also for a file with none of the `suffixes`.
+    Raises `BadArgument`, which calls the argument `name`, for a file that is missing or larger than
+    512 MiB. Raises it also for a file with none of the `suffixes`.
     """
     path = Path(path)
     allowed = f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"

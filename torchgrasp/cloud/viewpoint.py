@@ -129,7 +129,10 @@ def _draw(points: Points, normals: Points) -> tuple[Float[Tensor, "m 3"], Float[
 
 
 def is_along_z(points: Points) -> bool:
-    """Return whether a camera in the origin that looks along z has the points (n, 3) [m] ahead."""
+    """Return whether the points (n, 3) [m] are ahead of a camera in the origin that looks along z.
+
+    They are if the cosine between z and the direction to their mean exceeds 0.6 (`GUESS.ahead`).
+    """
     middle = points.mean(0)
     return float(middle[2]) > GUESS.ahead * float(norm(middle))
 

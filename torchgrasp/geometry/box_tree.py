@@ -17,7 +17,7 @@ class Boxes(NamedTuple):
     low: np.ndarray  # least coordinates (2 l, 3) of the points in a box
     high: np.ndarray  # greatest coordinates (2 l, 3)
     points: np.ndarray  # points (l, s, 3) of each leaf; NaN fills the last of them up
-    rows: np.ndarray  # index (l, s) of each of these points among the given ones
+    rows: np.ndarray  # index (l, s) of each of these points in the array that was sorted
 
 
 def sort_into_boxes(points: np.ndarray) -> Boxes:

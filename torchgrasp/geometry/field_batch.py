@@ -31,7 +31,7 @@ class FieldBatch(DistanceField):
     # origin (x, y, z) [m] of each field, and the spacing [m] of its nodes
     places: Float[Tensor, "c 4"]
     # Of each field: 3 indices of the last node on each axis, and 2 strides on x and y. Then the
-    # place of the first value in `nodes`, and 8 steps from a cell's first corner to its corners.
+    # index of the first value in `nodes`, and 8 steps from a cell's first corner to its corners.
     steps: Int[Tensor, "c 14"]
     owner: Int[Tensor, "r"]  # index of the field of each entry of the batch
 

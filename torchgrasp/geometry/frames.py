@@ -35,7 +35,9 @@ def rigid(
 def turned_about(
     rotation: Float[Tensor, "*b 3 3"], point: Float[Tensor, "3"], shift: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 4 4"]:
-    """Return the rigid transform that turns about a point (3,) [m], and then shifts [m]."""
+    """Return the rigid transform that rotates about a point (3,) [m], and then translates by
+    `shift` [m].
+    """
     return rigid(rotation, point + shift - rotation @ point)
 
 
@@ -125,8 +127,8 @@ def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
 def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
     """Return a mask of the contact sets whose f contacts lie nearly on a line.
 
-    Then twice the area of their largest triangle is at most `FLAT` times the square of the longest
-    side. The points [m] may be in any frame.
+    Then twice the area of their largest triangle is at most 0.001 (`FLAT`) times the square of the
+    longest side. The points [m] may be in any frame.
     """
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
     sides = corners - corners.roll(1, dims=-2)

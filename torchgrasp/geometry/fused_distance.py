@@ -24,8 +24,10 @@ def distance(
     surface: "MeshSurface",
     tried: int,
 ) -> np.ndarray:
-    """Return the signed distances [m] of points (n, 3), by the triangles of the `tried` nearest
-    samples.
+    """Return the signed distances (n,) [m] of points (n, 3) [m] from a surface, positive outside.
+
+    Each is the distance from the nearest of some triangles: those of the `tried` nearest `samples`
+    of the `surface`.
     """
     found = np.empty(len(points))
     points = np.ascontiguousarray(points, dtype=np.float64)

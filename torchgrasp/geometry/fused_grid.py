@@ -16,19 +16,24 @@ from torchgrasp.geometry.fused_vectors import dot, put, scale
 
 
 class LookedUp(NamedTuple):
-    """A grid of signed distances."""
+    """A grid of signed distances, negative inside an object, for compiled loops."""
 
-    values: np.ndarray
-    origin: np.ndarray
-    shape: np.ndarray
-    spacing: float
+    values: np.ndarray  # signed distances (n,) [m] at the nodes, those along z adjacent
+    origin: np.ndarray  # position (3,) [m] of node (0, 0, 0)
+    shape: np.ndarray  # number of nodes (3,) along each axis
+    spacing: float  # distance [m] of neighbouring nodes
 
 
 def query(
     grid: LookedUp,
     points: Float[Tensor, "*b 3"],
 ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-    """Return (distance, gradient) at points (*b, 3) [m]."""
+    """Return (distance, gradient) at points (*b, 3) [m], interpolated between the nodes of a grid.
+
+    `distance` (*b,) is the signed distance [m], and `gradient` (*b, 3) its derivative with respect
+    to the point (no unit). Outside the grid, the distance [m] from the grid is added to the value
+    at the border.
+    """
     distance = points.new_empty(points.shape[:-1])
     gradient = points.new_empty(points.shape)
     flat = array(points).reshape(-1, 3)
@@ -38,13 +43,19 @@ def query(
 
 @inlined
 def cell_of(part, p, axis):
-    """Return the coordinate of a point in a grid [nodes]."""
+    """Return the coordinate of a point `p` [m] on an axis of the grid `part`, in spacings from node
+    0.
+    """
     return (p[axis] - part.origin[axis]) / part.spacing
 
 
 @inlined
 def inside_grid(part, at, axis):
-    """Return the nearest coordinate inside the grid; 0 for NaN, which would be no index."""
+    """Return the coordinate within the grid `part` that is nearest to the coordinate `at` on an
+    axis.
+
+    Both are in spacings from node 0. NaN gives 0, as it would be no index.
+    """
     last = part.shape[axis] - 1.0
     at = at if at > 0.0 else 0.0
     return at if at < last else last
@@ -58,7 +69,10 @@ def _lerp(a, b, share):
 
 @inlined
 def look_up(part, p):
-    """Return distance and gradient, as `DistanceField.query`."""
+    """Return (distance, gradient) at a point `p` [m], interpolated in the grid `part`.
+
+    The signed distance is in metres; the gradient is a tuple of three numbers without unit.
+    """
     x = cell_of(part, p, 0)
     y = cell_of(part, p, 1)
     z = cell_of(part, p, 2)

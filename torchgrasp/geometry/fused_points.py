@@ -11,7 +11,8 @@ def nearest(points: np.ndarray, boxes: Boxes, limit: float) -> tuple[np.ndarray,
     """Return distance (n,) and index (n,) of the point in `boxes` that is nearest to each of the
     points (n, 3).
 
-    Where none is nearer than `limit`, they are infinity and 0.
+    The index is that in the array from which `boxes` was made. Where no point is nearer than
+    `limit`, distance and index are infinity and 0.
     """
     distance = np.empty(len(points))
     index = np.empty(len(points), np.int64)
@@ -21,7 +22,11 @@ def nearest(points: np.ndarray, boxes: Boxes, limit: float) -> tuple[np.ndarray,
 
 
 def farthest(points: np.ndarray, count: int, first: int, tie: float) -> np.ndarray:
-    """Return the indices of `count` points (n, d), as `farthest_points` chooses them."""
+    """Return the indices of `count` points (n, d), each the farthest from all points before it.
+
+    The choice begins with the point of the index `first`. Points whose squared distances differ by
+    at most the share `tie` count as equally far; the first of them is taken.
+    """
     picks = np.full(count, first)
     _put_farthest(np.ascontiguousarray(points), tie, picks)
     return picks
@@ -39,8 +44,10 @@ def _squared_gap(point, low, high):
 
 @inlined
 def find_nearest(point, boxes, stack, kept, nearest):
-    """Write the nearest samples into `nearest`, which are nearer than `kept`, with their squared
-    distances.
+    """Write the indices of the points in `boxes` that are nearest to a point into `nearest`.
+
+    Their squared distances replace those in `kept`, which ascend; only nearer points are taken.
+    Indices count the points of all leaves, leaf by leaf. `stack` is memory for the search.
     """
     low, high, samples = boxes
     leaves, size, _ = samples.shape

@@ -49,7 +49,10 @@ def copy(to, values):
 
 @inlined
 def insert(values, owners, value, owner):
-    """Put a value among ascending ones, and its owner among theirs; the last ones fall out."""
+    """Insert a value among ascending `values`, and its owner likewise among `owners`.
+
+    The last of each drops out. The value must be below the last of `values`.
+    """
     k = len(values) - 1
     while k > 0 and values[k - 1] > value:
         values[k] = values[k - 1]
@@ -61,7 +64,9 @@ def insert(values, owners, value, owner):
 
 @inlined
 def factorise(matrix):
-    """Replace the lower half of a matrix by its Cholesky factor; return whether there is one."""
+    """Replace the lower half of a matrix by its Cholesky factor; return whether it is positive
+    definite.
+    """
     for i in range(len(matrix)):
         for j in range(i + 1):
             rest = matrix[i, j]

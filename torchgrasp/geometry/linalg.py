@@ -96,7 +96,7 @@ def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 def number_rows(rows: Shaped[Tensor, "n d"]) -> Int[Tensor, "n"]:
-    """Return the number of each of n rows among the distinct rows in ascending order, from 0.
+    """Return the index (n,) of each of n rows in the sorted list of distinct rows.
 
     `torch.unique` of whole rows takes much longer than that of one column after the other.
     """
@@ -116,7 +116,11 @@ def number_rows(rows: Shaped[Tensor, "n d"]) -> Int[Tensor, "n"]:
 
 
 def number_cells(places: Float[Tensor, "n d"], side: float) -> Int[Tensor, "n"]:
-    """Return the number of the grid cell of each of n places, from 0; a cell is `side` wide."""
+    """Return the number, from 0, of the grid cell that holds each of n points.
+
+    Only cells with points are numbered. `places` are the points (n, d), and cells are `side` wide,
+    in their unit.
+    """
     return number_rows(torch.floor(places / side).long())
 
 

@@ -44,8 +44,8 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
     A bad mesh is never repaired.
 
     Raises:
-        MeshError: the file is no .obj, .off, .ply or .stl file, has no faces, or has too many faces
-            or bytes.
+        MeshError: the file is no .obj, .off, .ply or .stl file, or has more than 50 MiB.
+        MeshError: the mesh has no faces, or more than 500,000.
         MeshError: the mesh has vertices that are not finite, an open surface, or no volume.
         MeshError: the faces are not all turned outward.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the
@@ -234,8 +234,8 @@ def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
     """Return what `trimesh.load_mesh` reads from `data`, the bytes of a file with the given
     `suffix`.
 
-    `options` go to `trimesh.load_mesh`. Raises `Malformed` for too many faces; for bad bytes,
-    trimesh may raise any exception.
+    `options` go to `trimesh.load_mesh`. Raises `Malformed` for more than 500,000 faces
+    (`MESH_FACES`). For bad bytes, trimesh may raise any exception.
     """
     data = _geometry(data) if suffix == ".obj" else data
     if (faces := _count_faces(data, suffix)) > MESH_FACES:

@@ -32,9 +32,9 @@ class MeshDistanceNumbers:
     most_samples: int = 40_000
     """Most samples of a surface, which bounds the time."""
     few: int = 8
-    """For nodes beyond the band, one in this number of samples is used."""
+    """For points far from the surface, one in this number of samples is used."""
     tried: int = 3
-    """Number of triangles that are tried for a point within the band."""
+    """Number of triangles that are tried for a point near the surface."""
     leaf: int = 32
     """Samples in a leaf of the search tree."""
     at_once: int = 8192
@@ -47,7 +47,8 @@ MESH_DISTANCE = MeshDistanceNumbers()
 
 
 def surface_distance(vertices: Tensor, faces: Tensor) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that maps points (n, 3) [m] to their signed distances (n,) [m] from a mesh.
+    """Return a function that maps points (n, 3) [m] to signed distances (n,) [m], positive outside
+    a mesh.
 
     The mesh has outward faces: `vertices` (v, 3) [m], and `faces` (f, 3), the indices of three
     vertices each.
@@ -56,7 +57,11 @@ def surface_distance(vertices: Tensor, faces: Tensor) -> Callable[[np.ndarray], 
 
 
 class MeshSurface:
-    """The triangles of a mesh [m], with samples of the surface, to find distances to it."""
+    """The triangles of a mesh [m], with samples of the surface, to find distances to it.
+
+    It is made of the `vertices` (v, 3) and `faces` (f, 3), the indices of three vertices each.
+    Raises `BadArgument` for an index out of range, or if no face has an area.
+    """
 
     def __init__(self, vertices: Tensor, faces: Tensor):
         if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or faces.is_floating_point():
@@ -95,12 +100,14 @@ class MeshSurface:
 
     @cached_property
     def few(self) -> "Samples":
-        """One sample in some, for distant points."""
+        """One in 8 samples of the surface (`MESH_DISTANCE.few`), for distant points."""
         return Samples(self.samples[:: MESH_DISTANCE.few], self.owner[:: MESH_DISTANCE.few])
 
     def distance(self, points: np.ndarray, far: bool = False) -> np.ndarray:
-        """Return the signed distances [m] of points (n, 3); `far` uses fewer samples, for distant
-        points.
+        """Return the signed distances (n,) [m] of points (n, 3) [m] from the mesh, positive
+        outside.
+
+        `far` uses fewer samples, for distant points.
         """
         samples = self.few if far else self.every
         tried = 1 if far else min(MESH_DISTANCE.tried, len(self.owner))
@@ -126,7 +133,9 @@ class MeshSurface:
 
 
 class Samples:
-    """Points (s, 3) [m] of a surface and their triangles (s,), to find the nearest of them."""
+    """Points (s, 3) [m] of a surface, and the indices (s,) of their triangles, to find the nearest
+    points.
+    """
 
     def __init__(self, points: np.ndarray, owner: np.ndarray):
         self.points = points

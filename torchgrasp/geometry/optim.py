@@ -22,7 +22,7 @@ CHECK_EVERY = 6  # steps between two looks for ended problems on an accelerator:
 
 @dataclasses.dataclass(frozen=True)
 class Linearisation(Batch):
-    """The costs of a batch of problems at their current states; subclasses add the linear model."""
+    """The costs of a problems of a batch at their current states; subclasses add linear models."""
 
     cost: Float[Tensor, "a"]  # cost that is minimised (no unit)
 
@@ -50,10 +50,10 @@ class Minimisation(abc.ABC, Generic[State, Model]):
 
     @abc.abstractmethod
     def step(self, model: Model, damping: Damping) -> Steps:
-        """Return the step of each problem, from its damped normal equations, and a mask of the
-        problems that go on.
+        """Return the steps (a, d) of a problems, and a mask (a,) of those that go on.
 
-        `model` holds the linear models of the problems, and `damping` the damping of their steps.
+        Steps solve the damped normal equations. `model` holds the linear models of the problems,
+        and `damping` the damping of their steps.
         """
 
     @abc.abstractmethod
@@ -62,10 +62,10 @@ class Minimisation(abc.ABC, Generic[State, Model]):
 
     @abc.abstractmethod
     def judge(self, model: Model, trial: Model, x: Step, damping: Damping) -> Verdict:
-        """Return a mask of the accepted steps, and the damping of the next steps.
+        """Return a mask (a,) of the accepted steps, and the damping (a,) of the next steps.
 
         `model` is the linear model before the steps `x`, `trial` the one after them, and `damping`
-        that of these steps.
+        that of these steps. An infinite damping ends a problem.
         """
 
     def refuse(self, model: Model, trial: Model) -> Model:
@@ -84,7 +84,7 @@ def levenberg_marquardt(
 
     Every problem takes at most `steps` steps from its initial `state`, each with one evaluation. No
     gradient flows through the minimisation. Problems that have ended leave the batch. On an
-    accelerator this is checked only every `CHECK_EVERY` steps, because the host has to wait.
+    accelerator this is checked only every 6 steps (`CHECK_EVERY`), because the host has to wait.
     """
     whole = state
     rows = torch.arange(len(state), device=next(iter(named_tensors(state).values())).device)
@@ -168,7 +168,7 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
     def step(self, model: LinearResiduals, damping: Damping) -> Steps:
-        """Return the damped steps, and a mask of the problems that go on.
+        """Return the damped steps (a, d), and a mask (a,) of the problems that go on.
 
         The step of a problem with a singular matrix is zero.
         """
@@ -190,7 +190,8 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
     def judge(
         self, model: LinearResiduals, trial: LinearResiduals, x: Step, damping: Damping
     ) -> Verdict:
-        """Return a mask of the steps that lower the cost, and the damping of the next steps.
+        """Return a mask (a,) of the steps that lower the cost, and the damping (a,) of the next
+        steps.
 
         `model` holds the residuals before the step, `trial` those after it. The damping is infinite
         for a problem that has converged or is stuck, which ends it.

@@ -256,7 +256,7 @@ def upright_table(
     table.
 
     `obj_from_upright` is the frame's pose, as `upright_frame` returns it with this table. The
-    numbers of an edge are rounded to multiples of `GRID`.
+    numbers of an edge are rounded to multiples of 2^-20 (`GRID`), in metres or without unit.
     """
     if table is None or table.edge is None:
         return None if table is None else 0.0
@@ -270,9 +270,10 @@ def upright_table(
 def to_upright(
     points: Float[Tensor, "*b 3"], obj_from_upright: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "*b 3"]:
-    """Return points [m] in the upright frame, rounded to multiples of the small step `GRID` [m].
+    """Return points [m] in the upright frame, rounded to multiples of 2^-20 m (`GRID`), a
+    micrometre.
 
-    `obj_from_upright` is the frame's pose, as `upright_frame` returns it.
+    `obj_from_upright` (4, 4) is the frame's pose [m], as `upright_frame` returns it.
     """
     upright_from_obj = inverse(obj_from_upright).to(points.device)
     moved = apply(upright_from_obj, points.double().reshape(-1, 3))
@@ -282,8 +283,8 @@ def to_upright(
 def round_upright(value: SomeValue, obj_from_upright: Float[Tensor, "4 4"]) -> SomeValue:
     """Return a value, such as a cloud, in the upright frame, in float64 and rounded.
 
-    Every number of its tensors is rounded to a multiple of `GRID`, in its own unit.
-    `obj_from_upright` is the frame's pose.
+    Every number of its tensors is rounded to a multiple of 2^-20 (`GRID`), in its own unit.
+    `obj_from_upright` (4, 4) is the frame's pose [m] in the frame of the value.
     """
     return map_tensors(_round, move(value.to(torch.float64), inverse(obj_from_upright)))
 
@@ -299,7 +300,9 @@ def move(value: SomeValue, b_from_a: Float[Tensor, "4 4"]) -> SomeValue:
     """Return a value, such as a cloud or grasps, transformed from frame a to frame b, with lengths
     in metres.
 
-    Fields named in `POINTS`, `DIRECTIONS` or `POSES` change, also in values within the value.
+    `b_from_a` (4, 4) is the rigid transform. Fields of points, directions and poses change, also in
+    values within the value. Their names are in `POINTS`, `DIRECTIONS` and `POSES`; other fields
+    stay as they are.
     """
 
     def moved(name: str, x: Any) -> Any:

@@ -127,7 +127,7 @@ class SeenPoints:
         self.noise = assume_noise(points, eye)
 
     def part(self, of: Bool[Tensor, "n"]) -> "SeenPoints":
-        """Return some of the points, given by a mask, in the same frame."""
+        """Return the view of the points in the mask `of` alone, in the same frame."""
         return SeenPoints(self.points[of], self.eye, self.sky, self.image_up)
 
 
@@ -262,7 +262,10 @@ def _common_normal(points: Points, normal: Vector) -> Vector:
 
 
 def plane_axes(normal: Vector, points: Points) -> Float[Tensor, "3 2"]:
-    """Return two unit vectors (columns) perpendicular to a normal; they rotate with the points."""
+    """Return two perpendicular unit vectors, the columns of (3, 2), in the plane of a unit normal.
+
+    They follow from the points (n, 3): if points and normal are rotated, so are they.
+    """
     side = points[0] - points.mean(0)
     x = unit(side - (side @ normal) * normal)
     return torch.stack([x, torch.linalg.cross(normal, x)], -1)

@@ -228,8 +228,9 @@ def field_from_surface(
     """Return the signed distance field of a triangle mesh with outward faces, which may be open.
 
     `vertices` (v, 3) are in metres; `faces` (f, 3) holds the indices of three vertices each. The
-    nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh. Raises `BadArgument`
-    for more than 20 million nodes (`FIELDS.most_nodes`).
+    nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh. The field is in the
+    frame of the mesh. Raises `BadArgument` for more than 20 million nodes (`FIELDS.most_nodes`), or
+    for faces without area.
     """
     check_tensor("vertices", vertices, (None, 3))
     surface = MeshSurface(vertices, faces)

@@ -168,9 +168,10 @@ class SupportPlane:
 def bound(
     plane: Plane, points: Points, on: Bool[Tensor, "n"], eye: Vector | None
 ) -> SupportPlane | None:
-    """Return the support on a plane, with its region, or None if too few points lie on the plane.
+    """Return the support on a plane, with its region, or None if the points on it span no area.
 
     Args:
+        plane: the plane, with its normal to the upper side.
         points: all points (n, 3) [m] of the view.
         on: mask of the points that lie on the plane.
         eye: position (3,) [m] of the camera; None if unknown.
@@ -291,7 +292,7 @@ def cross(plane: Plane, points: Points, eye: Vector | None) -> tuple[Points, Boo
     behind it.
 
     `points` (n, 3) and the camera's position `eye` (3,) are in metres. Without a camera, `eye`
-    None, the points themselves are returned. Then points more than `PLANES.reach` [m] below the
+    None, the points themselves are returned. Then points more than 0.3 m (`PLANES.reach`) below the
     plane do not count as behind it.
     """
     height = plane.height(points)

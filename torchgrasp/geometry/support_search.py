@@ -31,16 +31,20 @@ SUPPORT = "a plane with objects on it and nothing seen through it, or a table th
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """Points (n, 3) [m] of a thing that is to be grasped.
+    """Points (n, 3) [m] of an object that is to be grasped.
 
-    They begin at most `reach` [m] above its support.
+    Its foot is at most `reach` [m] above the plane of its support.
     """
 
     points: Points
     reach: float
 
     def stands_on(self, support: SupportPlane) -> bool:
-        """Return whether the thing is over the region of a support, and begins at its plane."""
+        """Return whether the object is over the region of a support, with its foot near the plane.
+
+        More than half of its points are then over the region. Its foot is at most `reach` [m] above
+        the plane, or 30 mm (`SUPPORTS.foot`) below it.
+        """
         height = support.plane.height(self.points)
         foot = float(height.quantile(SUPPORTS.outliers))
         over = support.covers(self.points, SUPPORTS.overhang).double().mean()
@@ -171,9 +175,10 @@ def find_supports(
     Objects stand on a support, over its region, and the camera sees nothing through the region. The
     support with the most points low above it comes first. The points count twice if the camera
     looks at the support, and half if it is bowed. They count a quarter if the camera would have to
-    be upside down to see it from above. So do points on a wall beside it. Walls beside the first
-    support, on which far fewer points stand, are left out. Of parallel supports, a higher one as
-    wide as furniture comes first. A rigid motion of all arguments moves the supports alike.
+    be upside down to see it from above. Points that lie on another plane, perhaps a wall, count a
+    quarter, too. Walls beside the first support, on which far fewer points stand, are left out. Of
+    parallel supports, a higher one as wide as furniture comes first. A rigid motion of all
+    arguments moves the supports alike.
 
     Raises `NoSupport` if there is none.
     """

@@ -52,8 +52,9 @@ def cut_creases(
 ) -> Int[Tensor, "h w"]:
     """Return the number of the part to which each pixel belongs, 0 for none.
 
-    Each piece, a number > 0 in `pieces` (h, w), is cut into parts along its concave creases.
-    `points` (h, w, 3) [m] are those of the image, in the frame of its pose.
+    Each piece, a number > 0 in `pieces` (h, w), is cut into parts along its concave creases. There
+    two surfaces meet, as those of touching objects do. `points` (h, w, 3) [m] are those of the
+    image, in the frame of its pose.
     """
     least = scale_pixels(CREASE.part, pieces)
     # from the camera, so that normals can face it

@@ -46,7 +46,7 @@ def read_scene(path: Path | str) -> Scene:
 
     Raises `CloudFileError` for no such file, or for malformed content. Raises `BadArgument` for a
     `target` that is no label of an object, or a normal not of length 1. Also raises the errors of
-    `Scene.from_depth`.
+    `Scene.from_depth`, such as `NoSupport` if no table is found.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene
@@ -59,9 +59,12 @@ def read_scene(path: Path | str) -> Scene:
 def scene_of(
     arrays: dict[str, Any], table: Plane | float | None = None, up: Tensor | None = None
 ) -> Scene:
-    """Return the scene of a file's arrays, from `read_arrays`, as `read_scene` does.
+    """Return the scene of a file's arrays by name, which `read_arrays` returned.
 
-    Without a table among them, `table` and `up` are those of `Scene.from_depth`.
+    `table` and `up` are used only if no table is among the arrays. `table` is a plane, or its
+    height [m] along z; None means that it is fitted to the points. `up` is the direction (3,)
+    against gravity; None allows any. Raises `BadArgument` for arrays that are no scene, and
+    `NoSupport` if no table is found.
     """
     left = dict(arrays)
     own_table, pose, target = (left.pop(name, None) for name in ("table", "camera_pose", "target"))

@@ -122,7 +122,8 @@ class DepthImage(Value):
 
     @checked
     def to_upright(self, obj_from_upright: Pose) -> "DepthImage":
-        """Return the image with the pose of the camera in an upright frame, rounded.
+        """Return the image with the pose of the camera in an upright frame, rounded to multiples of
+        2^-30.
 
         `obj_from_upright` (4, 4) [m] is the pose of the upright frame in the image's frame "obj".
         """
@@ -147,9 +148,10 @@ class DepthImage(Value):
         return apply(self.obj_from_camera.double(), camera.reshape(-1, 3)).reshape(*z.shape, 3)
 
     def at_border(self, pixels: Int[Tensor, "n 2"]) -> bool:
-        """Return whether an object reaches the border of the camera's image.
+        """Return whether an object reaches the border of the camera's image, in 5 pixels or more.
 
-        `pixels` holds row and column of each of the object's n pixels.
+        `pixels` holds row and column of each of the object's n pixels. The bound is
+        `IMAGE.border_pixels`. An image that is not `bounded` gives False.
         """
         last = torch.tensor(self.depth.shape, device=pixels.device) - 1
         reaching = ((pixels <= 1) | (pixels >= last - 1)).any(-1)
@@ -180,8 +182,8 @@ def read_image(
     """Return a checked depth image in float64 [m].
 
     The arguments are those of `cloud_from_depth`; without a camera pose, the frame is the camera's
-    own. Raises `BadArgument` for what `cloud_from_depth` refuses, and for fewer than 30 measured
-    pixels.
+    own. Raises `BadArgument` for arguments of a wrong type, size or unit, and for a pose that is
+    not rigid. It is also raised for a distortion, and for fewer than 30 measured pixels.
     """
     z, k, _, lens = read_depth(depth, intrinsics, depth_unit=depth_unit)
     if lens is not None:
@@ -199,9 +201,9 @@ def read_image(
 
 
 def tell_rays(image: DepthImage) -> tuple[str, ...]:
-    """Return one note if the depths are perhaps distances from the camera, else none.
+    """Return one note, a sentence, if the depths are perhaps distances from the camera, else none.
 
-    As distances, they would put far more points into one plane.
+    Read as distances, they would put over 1.3 times as many points (`RAYS.better`) into one plane.
     """
     row, column = torch.nonzero(image.depth > 0, as_tuple=True)
     step = 1 + len(row) // RAYS.drawn

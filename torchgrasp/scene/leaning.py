@@ -48,7 +48,7 @@ class LeaningNumbers:
     most: float = 0.66
     """Least share of the sides that are alike."""
     told: float = 12.0
-    """Least leaning [deg] that is told: cups taper by less."""
+    """Least leaning [deg] for a note: cups taper by less."""
     top: float = 0.98
     """Quantile of the points' heights that is the height of an object."""
 
@@ -59,10 +59,11 @@ LEANING = LeaningNumbers()
 def tell_leaning(
     points: Points, labels: Int[Tensor, "n"], pose: Transform, table: Plane
 ) -> tuple[str, ...]:
-    """Return one note if the sides of several objects lean alike, as by a wrong focal length.
+    """Return one note, a sentence, if the sides of several objects lean alike, else none.
 
-    `labels` (n,) holds the object of each of the `points` (n, 3) [m], 0 for none. The `pose` (4, 4)
-    [m] leads from the camera's frame to that of the points and the `table`.
+    They lean by 12 degrees (`LEANING.told`) or more, as by a wrong focal length. `labels` (n,)
+    holds the object of each of the `points` (n, 3) [m], 0 for none. The `pose` (4, 4) [m] leads
+    from the camera's frame to that of the points and the `table`.
     """
     eye = pose[:3, 3].double().cpu()
     forward = pose[:3, 2].double().cpu()

@@ -112,7 +112,8 @@ MERGE = MergeNumbers()
 def merge_pieces(view: TableImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "k"]:
     """Return the number of the object to which each piece belongs; 0 for none.
 
-    Entry i of the result is for the piece with the number i in `pieces` (h, w); 0 is no piece.
+    A piece is a connected smooth surface of the image. Entry i of the result is for the piece with
+    the number i in `pieces` (h, w); 0 is no piece.
     """
     new = torch.zeros(int(pieces.max()) + 1, dtype=torch.long)
     whole = torch.bincount(pieces.reshape(-1))
@@ -157,7 +158,8 @@ def find_touching(
 ) -> list[tuple[int, int]]:
     """Return the pairs of labels of objects that touch, so that the border between them is a guess.
 
-    `labels` holds the label of each of the h x w `points` [m] of the image, 0 for none.
+    Objects touch if the gap between their points is below 4 mm (half of `MERGE.gap`). `labels`
+    holds the label of each of the h x w `points` [m] of the image, 0 for none.
     """
     names = labels[labels > 0].unique().tolist()
     if len(names) < 2:

@@ -174,7 +174,8 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
 def shadow_features(
     shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 6"]:
-    """Return the six features by which the model predicts whether points behind an object are full.
+    """Return the six features by which the model predicts whether points behind an object are
+    occupied.
 
     `points` (n, 3) [m] are in the upright frame of the scene, with z up; `owner` is the object's
     number in `shadows`. The features are, in order:
@@ -241,11 +242,12 @@ def load_occupancy_model() -> dict[str, Any]:
 
 
 def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]:
-    """Return the probability that n places of a kind are full.
+    """Return the probability that something else than the target occupies each of n hidden points.
 
-    Their log-odds are a sum of piecewise linear functions, one of each of f features. `kind`
-    "thing" has the features of `shadow_features`, and "target" the depth behind the surface and the
-    height z [m]. "unseen" has the height z [m].
+    Its log-odds are a sum of piecewise linear functions, one of each of f features. `kind` says
+    where the points are hidden. "thing", behind another object, has the features of
+    `shadow_features`. "target", behind the target, has the depth [m] behind its surface and the
+    height z [m]. "unseen", where nothing was measured, has the height z [m].
     """
     model = load_occupancy_model()[kind]
     odds = torch.full_like(features[:, 0], model["bias"])

@@ -17,9 +17,9 @@ from torchgrasp.scene.scene import Scene
 def take_away(scene: Scene, label: int) -> Scene:
     """Return the scene without an object: its pixels show the table behind it.
 
-    Where the table is not behind a pixel, or is unknown, nothing is measured. What the object hides
-    stays unseen: a target behind it shows no more of itself. Raises `BadArgument` for the target
-    and for a label of no object.
+    Where the table is not behind a pixel, or is unknown, the depth counts as not measured. What the
+    object hides stays unseen: a target behind it shows no more of itself. Raises `BadArgument` for
+    the target and for a label of no object.
     """
     device = scene.points.device
     scene = settle(scene, torch.device("cpu"))

@@ -76,8 +76,8 @@ class SceneNumbers:
     """Least distance [m] of such an object in front of the target: objects beside it cover nothing.
     """
     covered: float = 0.2
-    """Share of the target's outline that one object covers, above which it is told. Then a fifth of
-    the target is usually hidden.
+    """Share of the target's outline that one object covers, above which advice names it. Then a
+    fifth of the target is usually hidden.
     """
     afloat: float = 0.15
     """Greatest distance [m] of a target's foot from its table without a note: things in front of

@@ -147,9 +147,11 @@ def _risen(view: TableImage) -> Bool[Tensor, "h w"]:
 
 
 def at_one_jump(view: TableImage) -> Bool[Tensor, "h w"]:
-    """Return a mask of the pixels above the table that may lie on bars too thin for `rests_on`.
+    """Return a mask of the pixels above the table that may lie on thin bars, beside a jump of
+    depth.
 
-    Flying pixels, between a nearer and a farther surface, are left out.
+    `rests_on` misses such pixels. Flying pixels, between a nearer and a farther surface, are left
+    out.
     """
     before_jump, behind_jump = _jumps(view.smooth)
     return _risen(view) & ~(before_jump & behind_jump)
@@ -176,7 +178,7 @@ def _jumps(smooth: TableImage) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]
 
 def find_components(smooth: TableImage, core: Tensor) -> Int[Tensor, "h w"]:
     """Return the number, from 1, of each pixel's connected component in the mask `core`; 0 outside
-    of the mask.
+    of the mask. A jump of depth separates components.
     """
     h, w = core.shape
     depth = smooth.image.depth
@@ -253,7 +255,7 @@ def _widened(box: tuple[slice, slice], margin: int) -> tuple[slice, slice]:
 
 
 def count_labels(labels: Tensor, length: int = 0) -> Int[Tensor, "k"]:
-    """Return the number of pixels of each label 0, 1, ..., at least `length` numbers."""
+    """Return the number of pixels of each label 0, 1, ..., with zeros up to `length` numbers."""
     return torch.bincount(labels.reshape(-1), minlength=length)
 
 

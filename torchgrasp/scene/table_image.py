@@ -66,19 +66,26 @@ class TableImage(Value):
 
     @kept
     def height(self) -> Float[Tensor, "h w"]:
-        """The height of each pixel's point above the table [m]."""
+        """The height of each pixel's point above the table [m].
+
+        Where nothing was measured, it is the camera's height.
+        """
         return self.support.plane.height(self.points)
 
     @kept
     def smooth(self) -> "TableImage":
-        """The image without speckle, above the same support."""
+        """The image without speckle, above the same support.
+
+        Each depth is replaced by the median of the 3 x 3 pixels around it.
+        """
         return TableImage.of(self.image.without_speckle(), self.support)
 
     @kept
     def mean_height(self) -> Float[Tensor, "h w"]:
         """The mean height above the table of the 5 x 5 pixels around each pixel [m].
 
-        Only measured pixels within `HEIGHT.foot` of the table count; all others keep their height.
+        Only measured pixels within 30 mm (`HEIGHT.foot`) of the table count; all others keep their
+        height.
         """
         near = self.measured & (self.height.abs() < HEIGHT.foot)
         share = torch.from_numpy(ndimage.uniform_filter(near.double().numpy(), HEIGHT.window))
@@ -88,7 +95,10 @@ class TableImage(Value):
 
     @kept
     def flat(self) -> Bool[Tensor, "h w"]:
-        """Mask of the pixels on the table, which measure its noise."""
+        """Mask of the pixels on the table, which measure its noise.
+
+        Their mean heights are within 10 mm (`HEIGHT.band`) of the table.
+        """
         return self.measured & (self.mean_height.abs() < HEIGHT.band)
 
     @kept
@@ -105,7 +115,11 @@ class TableImage(Value):
 
     @kept
     def fitted_noise(self) -> Float[Tensor, "h w"]:
-        """The standard deviation [m] of mean heights at each pixel's depth, by a fitted model."""
+        """The standard deviation [m] of mean heights at each pixel's depth, by a model fitted to
+        the table.
+
+        The model is `SensorNoise.sigma`: a constant part and one that grows with the squared depth.
+        """
         depth = self.image.depth
         return fit_noise(depth[self.flat], self.mean_height[self.flat]).sigma(depth)
 

@@ -120,10 +120,11 @@ class Walls(Value):
         wall: Int[Tensor, "q"],
         rows: CovarianceRows,
     ) -> CovarianceRows:
-        """Return covariances with the observations, whitened as by `Posterior.whiten`.
+        """Return `rows` (q, r), covariances with the observations, times the `whitener` of a
+        surface.
 
-        Line q of `rows` holds covariances with the observations of the surface with the index
-        `wall[q]`.
+        Line q of `rows` belongs to the surface with the index `wall[q]`. The dot product of two
+        lines of the result is the covariance that the observations of one surface explain.
         """
         return self._together(wall, rows, lambda own, matrix: (own @ matrix,))[0]
 
@@ -171,8 +172,9 @@ class ShapeBatch(Value):
     """The shapes of c clouds, for a batch in which each entry belongs to one cloud.
 
     Points given to a method have the entries as axis 0. The points of entry r belong to the cloud
-    with the index `owner[r]`. Numbers of a shape, such as its `scale`, are tensors with one number
-    for each entry. Distances at normalised points are normalised, too.
+    with the index `owner[r]`. Methods of q points (q, 3) take equally many points of each entry,
+    entry by entry. Numbers of a shape, such as its `scale`, are tensors with one number for each
+    entry. Distances at normalised points are normalised, too.
 
     Args:
         surfaces: the posteriors of all surfaces: one for each cloud, then the inner ones of open
@@ -286,8 +288,8 @@ class ShapeBatch(Value):
         return x * spread(self.scale, x) + spread(self.centers[self.owner], x, 1)
 
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask of the surface among `walls` that applies at each of q normalised
-        points.
+        """Return a mask (q, walls) of the surface among `walls` that applies at each of q
+        normalised points.
         """
         if not self.hollow:
             return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)

@@ -148,9 +148,13 @@ def choose_points(
     criterion: Criterion,
     stop: float,
 ) -> tuple[Int[Tensor, "picks"], Float[Tensor, "rows rows"], Float[Tensor, "rows"]]:
-    """Return the picks of `select_points`, the grown Cholesky factor L, and L^-1 y.
+    """Return (picks, L, L^-1 y): the choice of `select_points`, with the grown Cholesky factor.
 
-    `start` is the posterior given the known observations. Rows of the factor go pick by pick.
+    `picks` are the indices of at most `budget` candidates, in the order of their choice. `start` is
+    the posterior given the known observations, whose Cholesky factor grows to L by four rows for
+    each pick. y are the observed numbers: those of `start`, then those of each pick. `criterion`
+    and `stop` are as in `select_points`: what is greatest at a pick, and the variance that ends the
+    choice.
     """
     x = candidates.x
     kernel = start.kernel

@@ -169,7 +169,7 @@ class ExtraObservations(Value):
     parts: tuple[Part, ...] = ()  # observed points of the outline and of the hidden side
     free: FreeSpace | None = None  # points in free space, or None if they are not used
     rows: Bool[Tensor, "rows"] | None = None  # mask of cloud points on this surface; None: all
-    kind: Kind = "guess"  # how the hidden side was completed, as in `ShapeGP`
+    kind: Kind = "guess"  # how the hidden side was completed, such as "mirrored"
 
 
 def paper_support(
@@ -208,8 +208,8 @@ def camera_support(
     noise: float,
     table: float | None,
 ) -> ExtraObservations:
-    """Return the observations in addition to the cloud's points, with distances that are true to
-    scale.
+    """Return the observations in addition to the cloud's points, with distances measured from these
+    points.
 
     If the cloud `seen` [m] is a view with a `completion`, they include its hidden side and free
     space. `noise` is the standard deviation of the distance observed inside, normalised; `table` is
@@ -449,10 +449,11 @@ def free_space_violations(
     x: Points,
     least: Float[Tensor, "n"],
 ) -> Tensor:
-    """Return the indices of some points of free space that lie well inside the shape, the worst
-    first.
+    """Return the indices of at most 16 points of free space that lie well inside the shape.
 
     `x` are n normalised points, and `least` the lower bounds of their signed distances, normalised.
+    The points violate these bounds by over 2 mm (`FREE.violation`), and lie far apart. The worst
+    comes first.
     """
     short = shape.mean(x) - least
     rows = flatnonzero(short < -FREE.violation / shape.scale)

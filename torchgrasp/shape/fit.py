@@ -141,6 +141,9 @@ def fit_shape(
         SuspiciousScale: an extent outside [5 mm, 2 m].
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
+    A `CloudWarning` is given for a doubtful cloud. It is `FewPoints` for fewer than 100 points, and
+    `Flat` for points in one plane.
+
     >>> from torchgrasp.geometry.linalg import unit
     >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
     >>> shape = fit_shape(PointCloud(0.04 * ball, ball))
@@ -175,7 +178,7 @@ class FitOptions:
     psi_scale: float = 1.5  # the kernel's length over the longest distance of observed points
     support: Literal["camera", "paper"] = "camera"  # observations besides the cloud's points
     kernel: KernelName | Kernel = "thin_plate"  # covariance of the signed distance at two points
-    criterion: Criterion = "variance"  # what is greatest at the most informative point
+    criterion: Criterion = "variance"  # the next point has the greatest variance, error, or both
 
     def selected(self) -> tuple[int, float]:
         """Return the greatest number of observed points, and the variance at which their selection
@@ -201,8 +204,8 @@ def fit_upright(
 
     `table` is the table's height [m]; None means no table. `seed` is the random seed, and `options`
     are those of `fit_shape`. `in_image` says that the points are pixels of a depth image. Then they
-    need not be compared with their camera. `neighbours` are those of the points in float64, if they
-    are known.
+    need not be compared with their camera. `neighbours` are those of the points in float64; None if
+    they are not yet known. A `CloudWarning` is given for a doubtful cloud, such as one in a plane.
     """
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))

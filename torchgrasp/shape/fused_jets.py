@@ -21,18 +21,31 @@ Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, float]
 
 
 def evaluate_mean(of: Weighted, x: Queries, gradient: bool) -> tuple[Tensor, ...]:
-    """Return the mean distance (q,) and, if `gradient` is True, its gradient (q, 3)."""
+    """Return the mean distance (q,) at q normalised points and, if `gradient` is True, its
+    gradient.
+
+    The gradient is (q, 3). `of` holds the observations and weights.
+    """
     found = _mean(of.arrays, x, bent=False)
     return found[:2] if gradient else found[:1]
 
 
 def evaluate_mean_jet(of: Weighted, x: Queries) -> tuple[tuple[Tensor, Tensor, Tensor], None]:
-    """Return the fields of `MeanJet`, and None in the place of the kernel's values."""
+    """Return ((distance, gradient, Hessian), None): the mean with derivatives at q normalised
+    points.
+
+    `of` holds the observations and weights. None stands for kernel values, which the function of
+    this name in `jets` returns.
+    """
     return _mean(of.arrays, x, bent=True), None
 
 
 def evaluate_jet(of: Weighted, x: Queries, explain: Explain) -> tuple[Tensor, ...]:
-    """Return the fields of `SurfaceJet`."""
+    """Return mean and variance of the distance with derivatives at q normalised points.
+
+    They are distance, gradient, Hessian, variance and the gradient of the variance. `of` holds the
+    observations and weights; `explain` is `Posterior.explain` of their posterior.
+    """
     mean = _mean(of.arrays, x, bent=True)
     near = len(of.b)
     explained, solved = explain(rows_at(of.x, near, of.kernel, x))
@@ -44,7 +57,11 @@ def evaluate_jet(of: Weighted, x: Queries, explain: Explain) -> tuple[Tensor, ..
 
 
 def rows_at(known: Points, near: int, kernel: Kernel, x: Queries) -> CovarianceRows:
-    """Return the covariance of the distances at q points with all observations."""
+    """Return the covariance (q, rows) of the distances at q normalised points with all
+    observations.
+
+    The first `near` of the observed points `known` have normals.
+    """
     found = x.new_empty(len(x), len(known) + 3 * near)
     _put_rows(array(x), array(known.T), psi_of(kernel), near, found.numpy())
     return found
@@ -62,8 +79,11 @@ def arrays_of(
     a: Float[Tensor, "#q n"],
     b: Float[Tensor, "#q 3 near"],
 ) -> Arrays:
-    """Return the arrays of the points of `of` with weights `a` of distances and `b` of normals, the
-    same or others for each query point.
+    """Return the observed points (3, n), two arrays of weights, and the kernel's length psi.
+
+    The points and the kernel are those of `of`. All q query points share the weights `a` of
+    distances and `b` of normals, or each has its own. Weights of normals become (1 or q, 3, n);
+    points without normals get 0.
     """
     shifts = a.new_zeros(len(b), 3, len(of.x))  # points without normals have weight 0
     shifts[..., : b.shape[2]] = b
@@ -71,7 +91,7 @@ def arrays_of(
 
 
 def psi_of(kernel: Kernel) -> float:
-    """Return the normalised length of a thin plate."""
+    """Return the normalised length psi of a thin plate kernel."""
     form = kernel.closed_form
     assert isinstance(form, partial)
     return float(form.args[0])
@@ -79,8 +99,10 @@ def psi_of(kernel: Kernel) -> float:
 
 @inlined
 def sum_thin_plate(x, y, a, b, psi, bent):
-    """Return the sums of `evaluate_mean_jet` at a point x over the n points y (3, n). They are
-    distance, gradient and, if `bent`, the six numbers xx, yy, zz, xy, xz and yz of the Hessian.
+    """Return distance, gradient and Hessian of a posterior mean at a point x, as tuples.
+
+    They are sums over n observed points y (3, n), weighted by a for distances and b for normals.
+    The Hessian is the six numbers xx, yy, zz, xy, xz and yz, which are valid only if `bent`.
     """
     distance = g0 = g1 = g2 = trace = xx = yy = zz = xy = xz = yz = 0.0
     for j in range(len(a)):
@@ -120,7 +142,7 @@ def sum_thin_plate(x, y, a, b, psi, bent):
 
 @inlined
 def put_hessian(hessian, curved):
-    """Write the six numbers of `sum_thin_plate` into a Hessian (3, 3)."""
+    """Write six numbers xx, yy, zz, xy, xz and yz (`curved`) into a symmetric Hessian (3, 3)."""
     for k in range(3):
         hessian[k, k] = curved[k]
     hessian[0, 1] = hessian[1, 0] = curved[3]

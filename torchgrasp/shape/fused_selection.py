@@ -17,7 +17,14 @@ from torchgrasp.shape.posterior import Posterior
 def choose_points(
     start: Posterior, candidates: Observations, budget: int, criterion: str, stop: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the results of the function of this name in `torchgrasp.shape.conditioning`."""
+    """Return (picks, L, L^-1 y): the most informative candidates, with the grown Cholesky factor.
+
+    `picks` are the indices of at most `budget` candidates, in the order of their choice. `start` is
+    the posterior given the known observations, whose Cholesky factor grows to L by four rows for
+    each pick. y are the observed numbers: those of `start`, then those of each pick. A pick has the
+    greatest "variance" or "error", or "both" (`criterion`). The choice ends when no variance
+    exceeds `stop`.
+    """
     x = candidates.x
     n = len(x)
     old = len(start.factor)

@@ -31,7 +31,9 @@ class Weighted:
 
     @cached_property
     def arrays(self) -> Any:
-        """The same for compiled loops, where all query points have one posterior."""
+        """These points and weights as arrays for compiled loops, if all query points have one
+        posterior.
+        """
         from torchgrasp.shape import fused_jets  # it imports numba
 
         return fused_jets.arrays_of(self, self.a[None], self.b.mT[None])
@@ -75,9 +77,9 @@ def evaluate_mean_jet(
     of: Weighted,
     x: Queries,
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Kernels]:
-    """Return the fields of `MeanJet` at q normalised points, and kernel values for the variance.
+    """Return ((distance, gradient, Hessian), kernel values): the mean at q normalised points.
 
-    `of` holds the observations and weights.
+    `of` holds the observations and weights. The kernel values serve to compute the variance.
     """
     known = of.x
     a = of.a
@@ -109,9 +111,10 @@ def evaluate_jet(
     x: Queries,
     explain: Explain,
 ) -> tuple[Tensor, ...]:
-    """Return the fields of `SurfaceJet` at q normalised points.
+    """Return mean and variance of the distance with derivatives at q normalised points.
 
-    `of` holds the observations and weights; `explain` is `Posterior.explain` of their posterior.
+    They are distance, gradient, Hessian, variance and the gradient of the variance. `of` holds the
+    observations and weights; `explain` is `Posterior.explain` of their posterior.
     """
     mean, (d, k, first, near_second) = evaluate_mean_jet(of, x)
     n = of.x.shape[-2]

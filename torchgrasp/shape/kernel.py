@@ -49,9 +49,10 @@ PROFILE = ProfileNumbers()
 
 
 class Formula(partial[Any]):
-    """A function of a module with its numbers given, which equals others of the same.
+    """A function of a module with fixed arguments, equal to others with the same function and
+    arguments.
 
-    A kernel of formulas is equal to its copies, and can be pickled.
+    So a kernel made of it equals its copies, and can be pickled.
     """
 
     def _compared(self) -> tuple[Any, ...]:
@@ -326,13 +327,17 @@ def _differentiate_rbf(length: float, variance: float, r: Tensor, count: int) ->
 
 
 def kernel_of(kernel: KernelName | Kernel, psi: float) -> Kernel:
-    """Return a kernel, given itself or by its name; `psi` is as in `kernel_by_name`."""
+    """Return a kernel, given itself or by its name.
+
+    The length of a named kernel follows from `psi`, a normalised length, as in `kernel_by_name`.
+    """
     return kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
 
 
 @checked
 def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
-    """Return a kernel by its name; its length follows from `psi`, a normalised length.
+    """Return the kernel "thin_plate", "matern52" or "rbf"; its length follows from `psi`,
+    normalised.
 
     All have the prior variance psi^3 of the distance and 6 psi of a gradient component.
     """

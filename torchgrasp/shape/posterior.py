@@ -83,10 +83,9 @@ class Posterior(Value):
     @kept
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
         """The matrix L^-T (r, r), where L is the Cholesky factor `factor`, as a list of blocks of
-        its columns.
+        columns.
 
-        Each block has all columns of a range, and the rows down to the last of them. The rows below
-        are zero.
+        The block of the columns i to j - 1 holds the rows 0 to j - 1. The rows below are zero.
         """
         rows = len(self.factor)
         one = torch.eye(rows, dtype=self.x.dtype, device=self.x.device)

@@ -176,7 +176,8 @@ def find_seen(
     """Return which of n surface points each of v cameras sees.
 
     `points`, `normals` and the cameras' positions `eyes` [m] are in the frame of the `field`, the
-    distances from the surface. A ray from a point to a camera must not meet the surface again.
+    distances from the surface. A ray from a point to a camera must not meet the surface again. The
+    cosine between ray and normal must exceed 0.3 (`VIEW.least_cosine`).
     """
     offset = eyes[:, None] - points
     towards = unit(offset)
@@ -201,10 +202,12 @@ def find_seen(
 def expect_deviation(
     shape: ShapeGP, targets: Float[Tensor, "t 3"], points: Points, seen: Bool[Tensor, "v n"]
 ) -> tuple[Float[Tensor, "t"], Float[Tensor, "v t"]]:
-    """Return (before, after): the surface's deviation [m] at t targets now, and after each view.
+    """Return (before, after): the surface's standard deviation [m] at t targets now, and after each
+    view.
 
-    View k of v measures those of the n `points` [m] that the mask `seen[k]` names. The posterior's
-    covariance does not depend on what is measured, so it is known before.
+    The t `targets` and n `points` [m] are in the cloud's frame. View k of v measures the points in
+    the mask `seen[k]`. The posterior's covariance does not depend on what is measured, so it is
+    known before.
     """
     count = len(points)
     joint = shape.joint(torch.cat([points, targets]).double())

@@ -147,7 +147,7 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
 
 
 def find_revolution(points: Points, normals: Points) -> Revolution | None:
-    """Return the upright body of revolution to which most points belong, or None.
+    """Return the upright body of revolution to which most points belong; None if there is none.
 
     `points` (n, 3) [m] and outward unit `normals` (n, 3) are in a frame with z up.
     """

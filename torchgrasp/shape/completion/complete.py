@@ -113,7 +113,7 @@ class Completion(Value):
     """Estimated m points of the hidden side, with their errors along the normals.
 
     The errors have the covariance noise^2 I + D D^T [m^2]. I is the identity, D is `deviations`,
-    and the noise is that of `HiddenNumbers`.
+    and noise is 3 mm (`HIDDEN.noise`).
     """
 
     points: Float[Tensor, "m 3"]  # points on the hidden side [m]
@@ -159,12 +159,11 @@ def correlated_errors(
     shared: Float[Tensor, "m c"],
     local: Float[Tensor, "m"] | float,
 ) -> Float[Tensor, "m k"]:
-    """Return correlated errors [m] of m points [m], a column for each of k independent causes. The
-    first c are those in `shared`.
+    """Return correlated errors [m] of m points [m], a column for each of k independent causes.
 
-    The `shared` errors [m] come first, then the modes of a smooth random field. The field's
-    variance at a point is the sum of squares of errors there. They are the `local` error [m] and
-    the `shared` errors.
+    The first c columns are the `shared` errors [m]. The others are the modes of a smooth random
+    field. Its variance at a point is the sum of squares of the `local` and the `shared` errors
+    there [m^2].
     """
     deviation = torch.sqrt(local**2 + (shared**2).sum(1))
     alike = torch.exp(-0.5 * (torch.cdist(points, points) / HIDDEN.part) ** 2)

@@ -79,9 +79,11 @@ def find_ellipsoid(
 ) -> Ellipsoid | None:
     """Return the ellipsoid, nearly a ball, that fits the whole cloud, or None if there is none.
 
-    `points` (n, 3) [m] and outward unit `normals` (n, 3) are those of the cloud; `table` is the
-    table's height [m], or None. The body may have a flat foot: the ellipsoid may reach below the
-    table, but not float above it.
+    It fits if the cloud's RMS distance from it is at most 1.65 mm (`ELLIPSOID.misfit`), among other
+    bounds. No axis may be more than 1.5 times another. `points` (n, 3) [m] and outward unit
+    `normals` (n, 3) are those of the cloud, and `outline` is its silhouettes. `table` is the
+    table's height z [m]; None means no table. The body may have a flat foot: the ellipsoid may
+    reach below the table, but not float above it.
     """
     rows = pick_apart(points, ELLIPSOID.points)
     fit = _Fit(points[rows].numpy(), normals[rows].numpy(), outline, table)

@@ -17,8 +17,10 @@ def match_images(
     """Return the probes (p, k, 3) [m] mirrored in p planes, their distances (p, k) [m] from the
     nearest points of the cloud, and the cosines (p, k) of the normals there.
 
-    `probes` are k points and their normals, and `normals` (n, 3) those of the cloud. Beyond `far`
-    [m] the distance is infinity, and the cosine that with the first normal.
+    `probes` are k points [m] and their unit normals. `planes` (p, 4) are (n, o) for planes n . x =
+    o, with a unit normal n and an offset o [m]. `boxes` hold the n points of the cloud, and
+    `normals` (n, 3) are theirs. Beyond `far` [m] the distance is infinity, and the cosine that with
+    the first normal.
     """
     p = len(planes)
     k = len(probes[0])
@@ -71,10 +73,13 @@ def look_up(
     rasters: tuple[Tensor, Tensor],
     least_depth: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the results of `Silhouette._look_up`.
+    """Return each point's distance from an outline, the depth [m] seen there, and its own depth
+    [m].
 
-    `camera` holds viewpoint, axes and corner of a silhouette, and `rasters` its distances and
-    depths.
+    The `points` (*b, 3) are in metres. The signed distance is that in the image plane at depth 1,
+    positive outside (no unit). `camera` holds the camera's position [m], its axes, and the first
+    node of the silhouette's rasters. `cell` is the distance of neighbouring nodes at depth 1.
+    `rasters` hold distance and depth at the nodes. Own depths are at least `least_depth` [m].
     """
     shape = points.shape[:-1]
     rows = array(points.reshape(-1, 3))

@@ -137,7 +137,8 @@ class Silhouette(Value):
     ) -> Float[Tensor, "*b"]:
         """Return how far [m] points [m] are outside the outline or in front of the visible surface.
 
-        It is 0 for points that may be hidden.
+        It is 0 for points that may be hidden. Space in front counts from 2 mm (`OUTLINE.front`)
+        before the surface on, because of noise.
         """
         outside, visible, depth = self._look_up(points)
         in_front = (visible - depth - OUTLINE.front).clamp_min(0)
@@ -230,7 +231,8 @@ class Outlines(Value):
     ) -> Float[Tensor, "*b"]:
         """Return how far [m] points [m] are outside the outline or in front of the visible surface.
 
-        It is that of the worst view, and 0 for points that may be hidden.
+        It is that of the worst view, and 0 for points that may be hidden. Space in front counts
+        from 2 mm (`OUTLINE.front`) before the surface on, because of noise.
         """
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
@@ -240,7 +242,8 @@ class Outlines(Value):
     ) -> Bool[Tensor, "*b"]:
         """Return a mask of the points [m] that may be on the hidden side.
 
-        No view excludes them, within a tolerance.
+        They are less than 1 mm (`OUTLINE.beside`) outside the visual hull. They are also less than
+        4 mm in front of the visible surface of every view.
         """
         return (self.hull_distance(points) < OUTLINE.beside) & (
             self.violation(points) < OUTLINE.front

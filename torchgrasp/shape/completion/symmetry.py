@@ -182,7 +182,7 @@ class SymmetryScorer:
 
     @functools.cached_property
     def boxes(self) -> Boxes:
-        """The same points in a tree of boxes, for compiled loops."""
+        """All points of the cloud in a tree of boxes, for compiled loops."""
         return sort_into_boxes(self.points.numpy())
 
     @property

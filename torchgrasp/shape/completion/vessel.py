@@ -195,8 +195,9 @@ def find_vessel(
 class HiddenWall(Batch):
     """Estimated points of a wall that the camera did not see.
 
-    The columns of `shared` are errors along the normals [m] for one standard deviation. It is that
-    of the axis position (two columns), the wall's thickness and the floor's height.
+    The columns of `shared` are the errors [m] along the normals that four causes make, at one
+    standard deviation each. The causes are the axis position (two columns), the wall's thickness
+    and the floor's height.
     """
 
     points: Float[Tensor, "m 3"]  # hidden points of the wall [m]
