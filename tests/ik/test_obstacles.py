@@ -180,3 +180,16 @@ def test_a_hand_that_begins_above_its_grasp_sweeps_from_there(hand, free, genera
         )  # beside the way without a rise
         assert float(collision_probability(hand, grasp, ball, None)) == 0
         assert float(collision_probability(hand, grasp, ball, table)) > 0.8
+
+
+def test_a_hand_is_lifted_along_the_normal_of_its_table(hand, free):
+    grasp = dataclasses.replace(free[0], approach=real([[0.0, 0.0, 1.0]]))
+    opened = apply(grasp.obj_from_hand, hand.sphere_centres(grasp.pregrasp))[0]
+    closed = apply(grasp.obj_from_hand, hand.sphere_centres(grasp.joints))[0]
+    outermost = torch.cat([opened, closed])[:, 0].max()
+    beside = closed[closed[:, 0].argmax()].clone()
+    beside[0] = outermost + 0.06
+    ball = Obstacles.of(ball_occupancy(beside, 0.01))
+    wall = Plane(real([1.0, 0.0, 0.0]), -1.0)
+    assert float(collision_probability(hand, grasp, ball, Plane.horizontal(-1.0))) == 0
+    assert float(collision_probability(hand, grasp, ball, wall)) > 0.8

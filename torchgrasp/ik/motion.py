@@ -220,16 +220,17 @@ def collision_probability(
     """Return the probability in [0, 1], for each of g grasps, that its hand hits one of the
     `obstacles`.
 
-    The hand approaches opened, closes, and is lifted along z. The probability is the largest
-    occupancy probability of the voxels that it sweeps. Hidden voxels behind one object are occupied
-    or free together. The approach ends in the pose of `opened_pose`, which is raised where the hand
-    would be in the `table`. None means no table.
+    The hand approaches opened, closes, and is lifted along the table's normal, or along z without a
+    table. The probability is the largest occupancy probability of the voxels that it sweeps. Hidden
+    voxels behind one object are occupied or free together. The approach ends in the pose of
+    `opened_pose`, which is raised where the hand would be in the `table`. None means no table.
     """
     closed = Configuration(grasps.joints, grasps.obj_from_hand)
     raised = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, table)
     opened = Configuration(grasps.pregrasp, raised)
     approach = _approach(_centres(hand, opened), grasps.approach, COARSE_STEPS)
-    centres = torch.cat([approach, _closing(hand, opened, closed), _lift(hand, closed, UP)], 1)
+    up = UP if table is None else table.normal
+    centres = torch.cat([approach, _closing(hand, opened, closed), _lift(hand, closed, up)], 1)
     radius = hand.collision_spheres.radius.to(centres).repeat(centres.shape[1])
     return obstacles.likelihood(centres.flatten(1, 2), radius)
 
