@@ -45,14 +45,15 @@ class PreferredForces(Value):
 class ForcePreference(Protocol):
     """A model of preferred finger forces, such as a model of stability.
 
-    Of balanced forces that need almost the least friction, those nearest to its preference are
-    taken.
+    Several sets of balanced forces may need almost the least friction. Of these, the one nearest to
+    the preferred forces is taken.
     """
 
     def preferred_forces(
         self, tips: Float[Tensor, "3 3"], force: Positive | None = None
     ) -> PreferredForces:
-        """Return the forces preferred for fingertips with given centres `tips` [m].
+        """Return the preferred normal forces of three fingertips with centres `tips` [m], in any
+        frame.
 
         `force` [N] is the normal force of the finger that presses hardest; with None the model
         chooses it.
@@ -147,11 +148,11 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
 
 
 def check_same_hand(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` if grasps are not the hand's: by its name, their fingers or joints, or
-    where their joints place its fingertips.
+    """Raise `BadArgument` if `grasps` were planned for another hand than `hand`.
 
-    Grasps whose metadata name no hand, fingers or joints need only the number of each. The places
-    are compared if the files of the hand are not those of the plan.
+    The names of hand, fingers and joints in `grasps.meta` must be those of `hand`. Where
+    `grasps.meta` lacks the names, only the numbers of fingers and joints are compared. If the files
+    of the hand have changed since the plan, its fingertips must still reach the planned contacts.
     """
     planned = grasps.meta.get("hand", hand.name)
     if planned != hand.name:
@@ -220,7 +221,8 @@ def tip_compliance(
     """Return the compliance [m/N] of each fingertip along its contact normal.
 
     `jacobian` [m/rad] is that of the contact points by the h actuated joints, whose `stiffness` [N
-    m/rad] is given. `normals` are unit vectors.
+    m/rad] is given. `normals` are unit vectors in the frame of the Jacobian. f counts fingertips,
+    and `*b` stands for any leading axes.
     """
     along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
     return (along**2 / stiffness).sum(-1)

@@ -59,7 +59,7 @@ class GoldenResult(NamedTuple):
 
 @checked
 def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
-    """Simulate each test case of `GOLDEN` in a `simulator`, and yield its result."""
+    """Simulate each test case of the tuple `GOLDEN` in a `simulator`, and yield its result."""
     for case in GOLDEN:
         thing = load_object(case.object)
         hand = load_hand(case.hand)

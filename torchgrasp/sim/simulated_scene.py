@@ -157,8 +157,8 @@ class SimulatedScene(abc.ABC):
     def keep(self) -> "Callable[[], SimulatedScene]":
         """Return a function that returns copies of this scene in its present state.
 
-        Each copy continues bitwise as this scene does. So several pulls can start from one closed
-        grasp.
+        Each copy continues with bitwise the same results as this scene. So several pulls can start
+        from one closed grasp.
         """
 
     @abc.abstractmethod

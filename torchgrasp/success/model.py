@@ -46,7 +46,9 @@ class SuccessModel(Value):
     kept: Float[Tensor, "r 3"]
 
     def log_odds(self, features: Float[Tensor, "g k"]) -> Float[Tensor, "g"]:
-        """Return the log-odds of success of g grasps with the given `FEATURES`."""
+        """Return the log-odds (natural logarithm) of success of g grasps with k `features`, which
+        are in the order of `FEATURES`.
+        """
         node = torch.zeros(
             len(features), len(self.feature), dtype=torch.int64, device=features.device
         )
@@ -60,9 +62,10 @@ class SuccessModel(Value):
     def mean_log_odds(
         self, features: Float[Tensor, "c g k"], weights: Float[Tensor, "c"]
     ) -> Float[Tensor, "g"]:
-        """Return the log-odds of the mean success of g grasps under c conditions.
+        """Return the log-odds of the mean probability of success of g grasps under c conditions.
 
-        `weights` are the probabilities of the conditions.
+        A condition is a pair of a friction and a mass. `features` are those of each grasp under
+        each condition, and `weights` the probabilities of the conditions.
         """
         log_odds = self.log_odds(features.flatten(0, 1)).view(features.shape[:2])
         if len(log_odds) == 1:
@@ -84,8 +87,8 @@ class SuccessModel(Value):
             depth = depth + 1
 
     def interval(self, log_odds: Float[Tensor, "*g"]) -> Float[Tensor, "*g 2"]:
-        """Return the least and the greatest share of grasps with these log-odds that held in
-        trials.
+        """Return the least and the greatest share, in [0, 1], of grasps with these log-odds that
+        held in trials.
 
         Both are interpolated linearly between `bands`.
         """
@@ -98,5 +101,5 @@ class SuccessModel(Value):
 
 @functools.cache
 def load_success_model(device: torch.device | str = "cpu") -> SuccessModel:
-    """Return the shipped model of success in float64, on a device."""
+    """Return the model of success that torchgrasp ships, in float64 on a `device`."""
     return read_value(MODEL, KIND, SuccessModel)[0].to(device)
