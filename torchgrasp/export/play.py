@@ -64,13 +64,13 @@ class PlayNumbers:
     """Parameters of an exported motion that a simulator plays: mount, approach and lift."""
 
     room: float = 0.1
-    """Range [m] of the mount beyond approach and lift."""
+    """Range of motion [m] of the hand's mount beyond approach and lift."""
     speed: float = 0.2
     """Speed [m/s] of the approach: the mean speed in our trials."""
     lift: float = 1.0
     """Time [s] of the lift."""
     friction: float = 0.1
-    """Least coefficient of friction for which the force is chosen."""
+    """Lower bound of the coefficient of friction in the choice of the pressing force."""
     force: float = 100.0
     """Largest normal force [N] of the strongest finger, far beyond what hands exert."""
     mass: float = 0.1
@@ -177,8 +177,8 @@ def stand(surface: Surface, table: Plane | None) -> Surface:
     """Return an estimated surface whose points below the table are moved up to it, along its
     normal.
 
-    On the round base of an estimate the object would rock. Without a table, the surface is returned
-    as it is.
+    On the round base of an estimated surface the object would rock. Without a table, the surface is
+    returned as it is.
     """
     if table is None:
         return surface
@@ -238,11 +238,12 @@ def _scene(
 
 @checked
 def pressing_force(spec: TrialSpec, mass: Positive) -> float:
-    """Return the normal force [N] of the strongest finger in play: `spec.force`, or by default what
-    the object needs.
+    """Return the normal force [N] of the strongest finger in play: `spec.force`, or what the object
+    needs if that is None.
 
-    With the default, two opposite fingers hold the weight of a `mass` [kg] and a push of `PUSH`.
-    They use half of the friction. It is at most `spec.max_force`, or else `PLAY.force`.
+    If it is None, two opposite fingers hold the weight of a `mass` [kg] and a push of 2.5 N
+    (`PUSH`). They do so with half of the friction coefficient. This force is at most
+    `spec.max_force`, and at most 100 N (`PLAY.force`).
 
     >>> round(pressing_force(TrialSpec(friction=0.8), 0.25), 1)
     6.2
