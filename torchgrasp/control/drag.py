@@ -143,7 +143,8 @@ class DragController:
 
     @checked
     def step(self, observation: Observation, period: Annotated[float, Range(1e-5, 1.0)]) -> Targets:
-        """Return the targets of joints and palm for the next tick.
+        """Return the targets of joints and palm for the next control tick, the time until the next
+        call.
 
         Args:
             observation: what the hand measures now.

@@ -73,15 +73,16 @@ def desired_forces(
     `points` [m] and outward unit `normals` are those of the f contacts, in any frame. The forces
     are in the same frame. The largest normal force is `strongest` [N]. `preferred` holds wanted
     normal forces of the fingers, of which only the ratios count; None means equal ones. Where no
-    balanced forces press at every contact, each force is `strongest` along the inward normal.
+    balanced forces press at every contact, each force is `strongest` along the inward normal. `*b`
+    stands for any leading axes.
     """
     balanced = least_friction_forces(points, normals, strongest, preferred)
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
 
 
 def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tensor, "g f 3"]]:
-    """Return the planned contacts of g grasps in the hand's frame: first the points [m], then the
-    outward unit normals.
+    """Return the f planned contacts of each of g grasps: first the points [m], then the outward
+    unit normals. Their frame is that of the hand's root link.
     """
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     points = apply(hand_from_obj, grasps.contacts.points.double())
@@ -201,13 +202,13 @@ def press(
     forces: Float[Tensor, "g f 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
-    """Return the joint targets and torques with which position-controlled drives exert given
-    forces.
+    """Return the joint targets and torques with which position-controlled drives exert the `forces`
+    in g grasps.
 
-    `joints` [rad] are the present actuated joints, and `jacobian` [m/rad] is that of the contact
-    points by them. `forces` [N] act on the object, in the frame of the Jacobian. `stiffness`
-    [N m/rad] is that of each actuated joint. For sliding joints, metres replace radians, and
-    newtons replace newton metres.
+    `joints` [rad] are the present positions of the h actuated joints. `jacobian` [m/rad] is that of
+    the f contact points by these joints. `forces` [N] act on the object, in the frame of the
+    Jacobian. `stiffness` [N m/rad] is that of each actuated joint. For sliding joints, metres
+    replace radians, and newtons replace newton metres.
     """
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)

@@ -139,8 +139,8 @@ def regulate(factor: float, observation: Observation, strength: float, period: f
 def held_forces(
     reference: ClosingReference, observation: Observation
 ) -> tuple[Float[Tensor, "f 3"], float]:
-    """Return balanced forces [N] on the object in the hand's frame, and the sum [N] of their normal
-    parts.
+    """Return balanced forces [N] of f fingertips on the object in the hand's frame, and the sum [N]
+    of their normal parts.
 
     The sum is over fingertips with a working sensor. The forces act at the sensed contacts, and
     their total wrench is zero. The planned forces are returned if a finger does not touch, or if no

@@ -88,7 +88,8 @@ def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> 
     2), Eq. (26).
 
     `error` [m] is e, from the fingertip to its contact, and `covariance` [m^2] is Sigma_cov. The
-    share is 1 at the contact, and near 0 where the error exceeds the shape's uncertainty.
+    share is 1 at the contact, and near 0 where the error exceeds the shape's uncertainty. Both are
+    in one frame. `*b` stands for any leading axes.
     """
     factor = cholesky(covariance, "the covariance of a contact", "add an isotropic floor")
     return torch.exp(-0.5 * squared_mahalanobis(error, factor))
@@ -99,7 +100,7 @@ def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     (27) of the paper.
 
     The gain is 4 / s (`POSITION_RATE`) at a standard deviation of 5 mm (`POSITION_FLOOR`).
-    `covariance` [m^2] is that of the contact's position.
+    `covariance` [m^2] is that of the contact's position. `*b` stands for any leading axes.
     """
     return POSITION_RATE * POSITION_FLOOR**2 / covariance.diagonal(dim1=-2, dim2=-1)
 
@@ -110,7 +111,7 @@ def force_gain(
     """Return the force gain [m/(s N)] on each axis, Eq. (28) of the paper. It is `alpha_f` [m N/s]
     divided by the axis's variance.
 
-    `covariance` [N^2] is that of the contact force.
+    `covariance` [N^2] is that of the contact force. `*b` stands for any leading axes.
     """
     diagonal = covariance.diagonal(dim1=-2, dim2=-1)
     return alpha_f[..., None] / diagonal if isinstance(alpha_f, Tensor) else alpha_f / diagonal
@@ -120,7 +121,8 @@ def damped_inverse(
     jacobian: Float[Tensor, "*b m h"], damping: float = DAMPING
 ) -> Float[Tensor, "*b h m"]:
     """Return the damped inverse J^T (J J^T + damping I)^-1 of a `jacobian` [m/rad], in rad/m.
-    `damping` is in m^2, m counts coordinates of points, and h counts joints.
+    `damping` is in m^2, m counts coordinates of points, and h counts joints. `*b` stands for any
+    leading axes.
     """
     m, h = jacobian.shape[-2:]
     eye = torch.eye(min(m, h), dtype=jacobian.dtype, device=jacobian.device)
@@ -144,7 +146,8 @@ def tip_velocity(
     """Return the commanded velocity [m/s] of each fingertip, the bracket in Eq. (25) of the paper.
 
     It is (1 - lambda) K_P e_x + lambda C_F e_f, shortened to at most 0.04 m/s (`MAX_SPEED`). Here
-    e_x and e_f are the errors of position and of force.
+    e_x and e_f are the errors of position and of force. All vectors are in one frame. `*b` stands
+    for any leading axes, of which the last is that of the fingers.
 
     Args:
         position_error: e_x, from each fingertip to its contact [m].
@@ -171,7 +174,7 @@ def stay_above(
 
     Its component along the table's unit normal `up` is raised to at least -r h. Here r is 4 / s
     (`POSITION_RATE`), and h = max(`height`, 0). The `height` [m] is that of each fingertip's lowest
-    point over the table. Velocities and `up` are in one frame.
+    point over the table. Velocities and `up` are in one frame. `*b` stands for any leading axes.
     """
     lacking = -POSITION_RATE * height.clamp_min(0.0) - velocity @ up
     return velocity + lacking.clamp_min(0.0)[..., None] * up
@@ -184,16 +187,17 @@ def joint_step(
     posture_error: Float[Tensor, "*b h"] | None = None,
     damping: float = DAMPING,
 ) -> Float[Tensor, "*b h"]:
-    """Return the change [rad] of the actuated joints in one tick that moves the fingertips with a
-    `velocity` [m/s].
+    """Return the change [rad] of the actuated joints in one control period that moves the
+    fingertips with a `velocity` [m/s].
 
     Damped least squares over all fingers replace the inverse Jacobian in Eq. (25) of the paper,
-    which coupled fingers lack. No joint changes by more than 0.05 rad (`MAX_STEP`).
+    which coupled fingers lack. `*b` stands for any leading axes. No joint changes by more than 0.05
+    rad (`MAX_STEP`).
 
     Args:
         jacobian: Jacobian [m/rad] of the f fingertips with respect to the h actuated joints.
         velocity: commanded velocity [m/s] of each fingertip, in the frame of the Jacobian.
-        period: period of the tick [s].
+        period: control period [s].
         posture_error: planned minus present joints [rad]. The motions that leave the fingertips at
             rest reduce it; None means that there are no such motions.
         damping: damping of the inverse [m^2].

@@ -92,7 +92,7 @@ class Settled:
         It is settled if all fingers touch. With `pressing`, each must also have a `share` of force
         control of at least 0.5, and a steady force. A force is steady if its average
         (`TactileState.average`) changed by at most 0.1 N (`NOISE`). The change counts from the last
-        tick that was not settled. `touching` marks the fingers that touch.
+        tick that was not settled. `touching` marks the fingers that touch. f counts fingers.
         """
         average = observation.tactile.average
         settled = bool(touching.all())
@@ -105,8 +105,8 @@ class Settled:
 
 
 def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
-    """Return each actuated joint's target minus position [rad] at which its drive exerts its
-    largest torque.
+    """Return, for each of h actuated joints, the target minus position [rad] at which its drive
+    exerts its largest torque.
     """
     hand = reference.hand
     # infinite where nothing is driven: (j, h)

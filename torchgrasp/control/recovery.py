@@ -393,8 +393,8 @@ class LiftCheck:
 
     A tick is one period of the controller. Call the check at the end of each tick of the lift; the
     call returns `lost`. It takes three arguments. The first is an `Observation`. The second is the
-    height [m] of the hand above its place at the start of the lift. The third is the tick's length
-    [s].
+    height [m] of the hand above its position at the start of the lift. The third is the tick's
+    length [s].
 
     `lost` becomes true, and stays so, at the first of two events (bounds: `LOST`):
 

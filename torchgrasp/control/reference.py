@@ -277,7 +277,8 @@ def next_target(
     period: float,
     fastest: float = math.inf,
 ) -> Float[Tensor, " h"]:
-    """Return the targets [rad] of the actuated joints one tick later, within the joint limits.
+    """Return the targets [rad] of the h actuated joints after another control period, within the
+    joint limits.
 
     No target moves faster than `fastest`: all joints slow down together, so that the fingertips
     keep their directions.
@@ -285,11 +286,11 @@ def next_target(
     Args:
         reference: the closing plan.
         target: the present targets [rad] of the h actuated joints.
-        velocity: commanded velocity [m/s] of each fingertip, in the frame of the planned hand's
-            root link.
+        velocity: commanded velocity [m/s] of each of f fingertips, in the frame of the planned
+            hand's root link.
         observation: the present observation.
         lead: largest difference [rad] between a target and the measured joint.
-        period: time [s] to the next tick.
+        period: control period [s]: time to the next targets.
         fastest: largest speed [rad/s] of a target.
     """
     jacobian = observation.jacobian @ reference.hand.actuated.coupling

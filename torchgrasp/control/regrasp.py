@@ -196,7 +196,7 @@ class GraspTry:
 
         Args:
             observation: what the hand measures at the end of the tick (`observe`).
-            height: height [m] of the hand above its place at the start of the lift.
+            height: height [m] of the hand above its position at the start of the lift.
             period: length [s] of the tick, 1e-5 to 1.
 
         Raises `BadArgument` for a period out of range, or a height outside [-1, 10] m.

@@ -118,7 +118,7 @@ def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -
     state of a closing.
 
     Forces are 0, contact points and normals NaN, in float64 on the CPU. The fingertips are sampled
-    at the next control tick.
+    at the next control tick, a period of the controller.
 
     Args:
         batch: sizes of further leading axes of all tensors; by default none.
@@ -311,7 +311,8 @@ def joint_jacobian(
     """Return the Jacobian [m/rad] of points on the fingertips with respect to all joints of the
     URDF.
 
-    The joints count as if none were coupled. `points` [m] are points on the fingertips.
+    The joints count as if none were coupled. `points` [m] are one point on each of the f
+    fingertips.
 
     `joints` [rad] are the positions of all j joints. Points and Jacobian are in the frame of the
     hand's root link.

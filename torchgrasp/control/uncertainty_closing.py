@@ -328,7 +328,7 @@ def slide_along(
     Their velocity along the table's unit normal `up` becomes r (g - h). Here r is 12 / s
     (`RIM.rate`), and g is 0.3 mm (`RIM.gap`). This brings them to the height g and keeps them
     there. h is `height` [m], that of each fingertip's lowest point over the table. `low` is a mask
-    of the fingertips that slide. Velocities and `up` are in one frame.
+    of the fingertips that slide. Velocities and `up` are in one frame. f counts fingertips.
     """
     down = RIM.rate * (RIM.gap - height) - velocity @ up
     return velocity + (down * low)[:, None] * up

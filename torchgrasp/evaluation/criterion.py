@@ -24,8 +24,8 @@ SLIP_ANGLE = math.radians(30)
 
 @dataclasses.dataclass(frozen=True)
 class Tick(Value):
-    """The state of the simulation at one control tick; with a leading axis t, the states at all
-    ticks.
+    """The state of the simulation at one control tick, a period of the controller. With a leading
+    axis t, it holds the states at all ticks.
 
     Poses and points are in the simulator's frame, whose z axis points up. j counts all joints of
     the URDF, in the order of the simulated scene. m counts neighbours: other bodies on the table.

@@ -159,8 +159,8 @@ def _is_backward(values: np.ndarray, low: float, high: float) -> bool:
 def read_posture(
     hand: Hand, values: dict[str, np.ndarray], what: str, refuse: Refuse
 ) -> Float[Tensor, "g h"]:
-    """Return the actuated joints [rad or m] of the hand in g grasps, on the CPU. `values` holds the
-    file's values (g,) of its joints by name.
+    """Return the h actuated joints [rad or m] of the hand in g grasps, on the CPU. `values` holds
+    the file's values (g,) of its joints by name.
 
     All values together must put each fingertip where the actuated joints alone put it, to 0.1 mm.
     Else the error that `refuse` makes is raised, which names the joint. A `GraspFileWarning` names
@@ -222,9 +222,9 @@ class _Fingers(Batch):
 def reach_tips(
     hand: Hand, joints: Float[Tensor, "g h"], tips: Float[Tensor, "g f 3"]
 ) -> tuple[Float[Tensor, "g h"], Float[Tensor, "g"]]:
-    """Return actuated joints [rad or m] within their limits that bring the fingertips' contact
-    points to `tips` [m]. Return also the greatest distance [m] that is left between them, for each
-    of g grasps.
+    """Return h actuated joints [rad or m] within their limits that bring the contact points of f
+    fingertips to `tips` [m]. Return also the greatest distance [m] that is left between them, for
+    each of g grasps.
 
     `tips` are in the frame of the hand's root link. The search starts at `joints`.
     """

@@ -183,7 +183,7 @@ def carries_weight(
     Args:
         hand: the hand of the grasps.
         grasps: the grasps, in an upright frame.
-        center: centre of mass [m]: one for all grasps, or one for each.
+        center: centre of mass (3,) [m] for all grasps, or one for each (g, 3).
         mass: the lifted mass [kg].
         spec: its `planned_friction` and `edges` define the friction cones.
         most: greatest normal force [N] of a finger in the task.

@@ -76,9 +76,9 @@ def carrying_force(
 
     The result holds a factor (no unit) for each of m `frictions`, the friction coefficients, and b
     contact sets. `forces` f_0 [N] balance each other without a load. The `load` [N] acts at
-    `center` [m], one point or one for each set. A force of the size `push` [N] in any direction
-    acts there, too. All vectors are in the frame of the contacts. The wrench of load and push is w.
-    Equal springs share it, with the grasp map G:
+    `center` [m], one point (3,) or one for each set (b, 3). A force of the size `push` [N] in any
+    direction acts there, too. All vectors are in the frame of the contacts. The wrench of load and
+    push is w. Equal springs share it, with the grasp map G:
 
         f = s f_0 - G^+ w,    y . f >= 0 for all edges y of the cones dual to the friction cones.
 
@@ -109,7 +109,8 @@ def greatest_force(
     """Return the largest factor (no unit) on the `forces` [N] of each of g grasps at which no drive
     exceeds its greatest torque.
 
-    The forces at the contacts are in the frame of the grasps. Forces that are NaN give NaN.
+    The forces (g, f, 3) act at the f contacts of each grasp, in the frame of the grasps. Forces
+    that are NaN give NaN.
     """
     jacobian, pushes, effort = _levers(hand, grasps, grasps.contacts, forces)
     torque = torch.einsum("gfih,gfi->gh", jacobian, pushes)

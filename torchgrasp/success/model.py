@@ -32,7 +32,7 @@ class SuccessModel(Value):
     are fractions in [0, 1], have no unit.
     """
 
-    feature: Int[Tensor, "t m"]  # the feature that a node reads
+    feature: Int[Tensor, "t m"]  # index, from 0, of the feature that a node reads
     # a grasp goes to the first child where the feature is at most this
     threshold: Float[Tensor, "t m"]
     children: Int[Tensor, "t m 2"]  # indices of a node's two children; a leaf is its own child
@@ -40,9 +40,10 @@ class SuccessModel(Value):
     start: Float[Tensor, ""]  # log-odds without any tree
     range: Float[Tensor, "k 2"]  # least and greatest value of each feature in the trials
     usual: Float[Tensor, "k"]  # the median of each feature among grasps that held
-    # log-odds in ascending order, each with the least and greatest share of grasps that held there
+    # n ascending log-odds, each with the least and greatest share of such grasps that held in trials
     bands: Float[Tensor, "n 3"]
-    # of each trial of the best grasp for a task: log-odds, 1 if it held, the number of the family
+    # of r trials, each of the best grasp for a task: log-odds, 1 if it held (else 0), and the number
+    # of the family of bodies
     kept: Float[Tensor, "r 3"]
 
     def log_odds(self, features: Float[Tensor, "g k"]) -> Float[Tensor, "g"]:
@@ -88,7 +89,7 @@ class SuccessModel(Value):
 
     def interval(self, log_odds: Float[Tensor, "*g"]) -> Float[Tensor, "*g 2"]:
         """Return the least and the greatest share, in [0, 1], of grasps with these log-odds that
-        held in trials.
+        held in trials. The result has one pair for each of the `log_odds`, of any shape.
 
         Both are interpolated linearly between `bands`.
         """

@@ -75,8 +75,8 @@ def touch_moved(
     The displacements are at most 20 mm long (`MOVED.radius`). They fill a ball evenly, in the axes
     of the hand. The contacts are in the frame of the object, as `field`. Each fingertip moves along
     the straight line from its position in the pre-grasp to that in the grasp. It goes on beyond,
-    until it touches the surface that `field` gives. The balanced `forces` [N] at the planned
-    contacts say in which ratios the fingers push.
+    until it touches the surface that `field` gives. The balanced `forces` (g, f, 3) [N] at the f
+    planned contacts of each grasp say in which ratios the fingers push.
     """
     count = MOVED.count
     numbers = torch.arange(count, dtype=torch.float64, device="cpu")

@@ -172,8 +172,9 @@ class OpenLoopClosing:
     def advance(self, period: float) -> Float[Tensor, "*n j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later.
 
-        They are (j,) for one hand. They are (n, j) if the attribute `poses` holds the postures (3,
-        n, j) [rad] of n hands: pre-grasp, grasp and squeeze.
+        j counts all joints of the URDF. The targets are (j,) for one hand. They are (n, j) if the
+        attribute `poses` holds the postures (3, n, j) [rad] of n hands: pre-grasp, grasp and
+        squeeze.
         """
         self.time += period
         progress = min(self.time / POSE_TIME, 2.0)
@@ -226,7 +227,7 @@ def spring_forces(
 
     The forces are in the frame of `points` [m], the centres of the fingertips. `lengths` [m] are
     the rest lengths of the sides (0, 1), (1, 2) and (2, 0), and `stiffness` [N/m] is that of each
-    spring.
+    spring. `*b` stands for any leading axes.
     """
     tension = stiffness * (side_lengths(points) - lengths)
     return torch.einsum("...k,...kci->...ci", tension, internal_forces(points))
