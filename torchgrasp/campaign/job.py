@@ -74,10 +74,10 @@ def run_job(
 
     `protocol` is the test of each grasp, and `spec` says which grasps are tried. `meta` holds the
     `versions` of the software with which the campaign began. Every machine must have them, and the
-    same hand. `plans` is the list that `plan_jobs` returned, and the job's plan is `plans[place]`.
-    Otherwise the job is planned here: `plans` is then None, or the `Status` of a planning that took
-    too long. A faulty object gives a `JobRow` with the reason. Errors that are not the object's
-    fault are raised.
+    same hand. If `plans` is the list that `plan_jobs` returned, the job's plan is `plans[place]`.
+    If `plans` is None, or the `Status` of a planning that took too long, the job is planned here. A
+    faulty object gives a `JobRow` with the reason. Errors that are not the object's fault are
+    raised.
     """
     check_versions(meta)
     hand = view.load_hand()

@@ -191,8 +191,8 @@ def joint_step(
     fingertips with a `velocity` [m/s].
 
     Damped least squares over all fingers replace the inverse Jacobian in Eq. (25) of the paper,
-    which coupled fingers lack. `*b` stands for any leading axes. No joint changes by more than 0.05
-    rad (`MAX_STEP`).
+    which coupled fingers lack. No joint changes by more than 0.05 rad (`MAX_STEP`). `*b` stands for
+    any leading axes.
 
     Args:
         jacobian: Jacobian [m/rad] of the f fingertips with respect to the h actuated joints.

@@ -127,7 +127,7 @@ class LeastForces:
 
     Args:
         start: forces (f, 3) [N] on the object from which the first call starts; they press at every
-            contact.
+            contact, in the frame of all later vectors.
         effort: largest torque (j,) [N m] of each of the j joints of the URDF.
         most: largest normal force [N] of each finger.
     """

@@ -101,7 +101,8 @@ LOST = LostNumbers()
 def can_guard(reference: ClosingReference) -> bool:
     """Return whether the hand can stop its approach at a touch.
 
-    It can if the plan has an approach, a table and a surface, and its fingertips are tactile.
+    It can if the plan `reference` has an approach, a table and a surface, and its fingertips are
+    tactile.
     """
     needed = reference.approach, reference.table, reference.surface
     return reference.sensor.kind == "tactile" and all(x is not None for x in needed)

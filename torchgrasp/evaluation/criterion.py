@@ -68,7 +68,8 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
 
 
 def motion_between(first: Tick, last: Tick, in_hand: bool = True) -> ObjectMotion:
-    """Return the motion [m] of the object's centre and its rotation [rad] from one tick to another.
+    """Return the motion [m] of the object's centre and its rotation [rad] from the control tick
+    `first` to `last`.
 
     They are relative to the hand, or to the world if not `in_hand`.
     """

@@ -74,8 +74,7 @@ class DragResult(Value):
             `DROPPED`: the object toppled, or hangs or fell over the edge.
             `SLIPPED`: the object is more than 20 mm (`DRAGS.slipped`) from its planned position.
             `START_OVERLAP`: the hand overlapped the object or the table at the start.
-            `UNSTABLE`:
-            the simulation diverged.
+            `UNSTABLE`: the simulation diverged.
         motion: motion (4, 4) [m] of the object from the start of the trial to its end. It is a
             rigid transform in the frame of the planned cloud. NaN if the status is `UNSTABLE`.
         missed: distance [m] of the object's centre of mass from its planned position. NaN if the

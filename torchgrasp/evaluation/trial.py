@@ -345,7 +345,7 @@ class TrialRun:
     @property
     def starts(self) -> bool:
         """Whether the trial starts: the opened hand penetrates other bodies and itself by at most
-        `TrialSpec.overlap`.
+        `TrialSpec.overlap`, by default 1 mm.
         """
         return self.overlap <= self.spec.overlap
 
@@ -412,8 +412,8 @@ class TrialRun:
     def hold(self, seconds: float) -> None:
         """Hold the object for a time `seconds` [s].
 
-        A hand that closed in open loop reaches its last targets one tick after its closing ends.
-        Then it keeps them, whatever it would observe.
+        A hand that closed in open loop reaches its last targets one control tick after its closing
+        ends. Then it keeps them, whatever it would observe.
         """
         ticks = self.robot.ticks(seconds)
         rests = not self.controller.closing.feels and self.controller.closed

@@ -324,10 +324,10 @@ def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
 def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
     """Return the values with which the templates of USD files are filled, by name.
 
-    They are "parts", the convex parts of the object, and "links" and "joints". The last two are of
-    the hand and of the mount that carries it. Each is a list with one entry for each part, link or
-    joint. All joints are at zero. Lengths are in metres, masses in kilograms. Raises `BadArgument`
-    for names of links or joints that USD does not allow.
+    Each is a list. "parts" has an entry for each convex part of the object. "links" and "joints"
+    have one for each link or joint of the hand and of the mount that carries it. All joints are at
+    zero. Lengths are in metres, masses in kilograms. Raises `BadArgument` for names of links or
+    joints that USD does not allow.
     """
     urdf = scene.urdf
     moment = PLAY.inertia

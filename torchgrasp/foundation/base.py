@@ -356,7 +356,7 @@ def row_numbers(rows: Tensor) -> Int[Tensor, "n"]:
 
 
 def flatnonzero(mask: Bool[Tensor, "n"]) -> Int[Tensor, "k"]:
-    """Return the indices of the entries of a mask that are True, ascending."""
+    """Return the indices (k,) of the k entries of a mask (n,) that are True, ascending."""
     return torch.nonzero(mask)[:, 0]
 
 

@@ -97,7 +97,9 @@ NUMBERS = {
 
 
 def describe(hint: Any) -> str:
-    """Return a text that says which arguments an annotation allows."""
+    """Return a text, for error messages, that says which arguments the type annotation `hint`
+    allows.
+    """
     origin = typing.get_origin(hint)
     inside = typing.get_args(hint)
     if origin is Annotated and isinstance(inside[1], Range):

@@ -28,7 +28,9 @@ _state: dict[str, Any] = {"calls": 0, "products": None, "backends": []}
 
 
 def in_autocast() -> bool:
-    """Return whether torch may round the numbers of this thread to a smaller dtype."""
+    """Return whether `torch.autocast` is on in this thread, for any device. Torch may then round
+    numbers to a smaller dtype.
+    """
     return any(map(torch.is_autocast_enabled, DEVICES))
 
 

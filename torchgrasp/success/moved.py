@@ -54,10 +54,11 @@ class MovedContacts(NamedTuple):
     """Contact sets of g grasps after each of d displacements of the object.
 
     Args:
-        contacts: contact points [m] and outward normals in the object's frame, f for each set. The
-            d g sets are ordered by displacement, then by grasp.
+        contacts: the d g contact sets: contact points [m] and outward normals in the object's
+            frame, one for each of the f fingertips. The sets are ordered by displacement, then by
+            grasp.
         forces: balanced contact forces [N] of these sets, of which the largest normal force is 1 N;
-            NaN if there are none.
+            NaN if there are none. They are in the order and frame of `contacts`.
         touched: whether all f fingers of a grasp touch the displaced object, and can press on it
             with balanced forces.
     """
