@@ -148,7 +148,7 @@ class DragController:
 
         Args:
             observation: what the hand measures now.
-            period: time [s] until the next tick, 1e-5 to 1.
+            period: time [s] until the next control tick, 1e-5 to 1.
 
         Raises `BadArgument` for a period outside 1e-5 to 1 s.
         """

@@ -220,7 +220,8 @@ class GripHold:
 
     @property
     def mass(self) -> Distribution | None:
-        """The mass [kg] that the steady load shows, while nothing else pushes at the object.
+        """The `Distribution` of the object's mass [kg], from the steady load, while nothing else
+        pushes at the object.
 
         None if no load is steady. A load that is too heavy bounds the mass below.
         """

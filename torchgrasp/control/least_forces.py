@@ -207,7 +207,7 @@ class LeastForces:
         jacobian: Float[Array, "f 3 j"],
     ) -> float:
         """Return the largest ratio of a joint torque or a normal force to its limit, for given
-        forces [N].
+        `forces` [N]. The limits are `effort` and `most`.
 
         `normals` are outward unit vectors, and `jacobian` [m/rad] is that of the fingertips by all
         joints.

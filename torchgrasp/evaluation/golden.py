@@ -45,7 +45,7 @@ GOLDEN = (
 
 
 class GoldenResult(NamedTuple):
-    """The outcome of a test case."""
+    """The outcome of a test case of the simulation."""
 
     case: GoldenCase
     held: bool  # whether the simulated hand held the object

@@ -320,7 +320,9 @@ class RecordedLift:
         return motion_between(self.ticks[first], self.ticks[last], in_hand)
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
-        """Return the record of the trial as a `ClosureResult`."""
+        """Return the record of the trial as a `ClosureResult`, with its `status` and its wall time
+        `seconds` [s].
+        """
         ticks = map_tensors(lambda *tensors: torch.stack(tensors), *self.ticks)
         robot = self.run.robot
         obj_from_world = self.run.obj_from_world

@@ -266,7 +266,8 @@ def draw_trial(trial: TrialSpec, seed: Seed) -> TrialSpec:
 
 @checked
 def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Return n = `count` random pose errors of the hand [m], each in the frame of the planned hand.
+    """Return n = `count` random pose errors of the hand, rigid transforms [m] in the frame of the
+    planned hand.
 
     `noise` bounds them.
     """

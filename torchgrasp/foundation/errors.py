@@ -72,8 +72,8 @@ class TooFewPoints(BadArgument):
 
 
 class SuspiciousScale(BadArgument):
-    """A cloud or a mesh is too small or too large to grasp, mostly under 5 mm or over 2 m. Its unit
-    may be millimetres.
+    """A cloud or a mesh is too small or too large to grasp. Mostly it is under 5 mm or over 2 m,
+    and its unit may be millimetres.
     """
 
 

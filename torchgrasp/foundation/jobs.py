@@ -272,7 +272,8 @@ def pack(value: Any, known: dict[int, Any] | None = None) -> Any:
     """Return a value in a form for another process; `unpack` restores it.
 
     NumPy arrays take the place of tensors, which processes would share. `known` maps the `id` of
-    each packed object to its packed form. So an object that occurs twice is sent once.
+    each object that is already packed to its packed form; None means no object. So an object that
+    occurs twice is sent once.
     """
     known = {} if known is None else known
     if id(value) in known:

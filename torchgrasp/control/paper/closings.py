@@ -37,7 +37,7 @@ GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the 
 
 @dataclasses.dataclass(frozen=True)
 class PositionNumbers:
-    """Parameters of `PositionClosing`; the paper prints no gains."""
+    """Parameters of `PositionClosing`, a baseline whose gains the paper does not print."""
 
     depth: float = 0.02
     """Distance [m] of a fingertip's goal behind the planned contact, inside the object."""

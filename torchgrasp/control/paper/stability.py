@@ -90,8 +90,8 @@ class StabilityModel(Value):
     def preferred_forces(
         self, tips: Float[Tensor, "3 3"], force: Positive | None = None
     ) -> PreferredForces:
-        """Return the typical forces and stiffness of stable grasps whose fingertips are as far
-        apart as the `tips` [m].
+        """Return the typical forces [N] and stiffnesses [N/m] of stable grasps with fingertip
+        centres `tips` [m]. Only the distances of the tips from their centroid count.
 
         `force` [N] is the normal force of the finger that presses hardest; None means that the
         model chooses it.
