@@ -38,7 +38,9 @@ class LawNumbers:
     inertias.
     """
     outward: float = 1e-4
-    """Distance [m] outside a contact at which no shape may be."""
+    """Distance [m] from a pad's contact point, along its outward normal, at which no collision
+    shape of the hand may be.
+    """
 
 
 LAWS = LawNumbers()
@@ -128,7 +130,8 @@ def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
 def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Iterator[HandFileError]:
     """Yield an error for each rule that the files of a hand break.
 
-    Raises the error of `load_hand` if it cannot load them.
+    The rules are those of `check_hand`; its three laws of kinematics are not tested. Raises
+    `HandFileError` or `BadArgument` if `load_hand` cannot load the hand.
     """
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
     urdf = read_urdf(spec.urdf)
@@ -139,7 +142,7 @@ def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Itera
 
 
 def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:
-    """Return the names of the two links of a hand that overlap in the most of n postures.
+    """Return the names of the two links of a hand that overlap in the largest number of n postures.
 
     `joints` (n, h) are positions of the h actuated joints [rad].
     """
@@ -208,10 +211,11 @@ def _inside(point: np.ndarray, shape: LinkShape) -> bool:
 
 
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
-    """Return the largest difference of a pose from yourdfpy's, and the name of its link.
+    """Return the largest difference between a link's pose and that of yourdfpy, and the name of the
+    link.
 
-    Differences are those of entries of poses (4, 4): [m], or entries of rotations. `joints` (n, h)
-    are positions of the h actuated joints [rad].
+    A difference is that of one entry of a pose (4, 4): of a translation [m], or of a rotation
+    matrix (no unit). `joints` (n, h) are positions of the h actuated joints [rad].
     """
     urdf = read_urdf(hand.urdf_path)
     poses = hand.link_poses(joints).double()

@@ -17,7 +17,7 @@ OUTSTANDING = 10_000
 
 
 class OnGpu(NamedTuple):
-    """A task for a worker with the resource "GPU", whose result is an argument of other tasks.
+    """A task for a Dask worker with the resource "GPU", whose result is an argument of other tasks.
 
     The worker calls `function` with the arguments `task`.
     """
@@ -31,13 +31,14 @@ def run_on_cluster(
 ) -> Generator[tuple[int, Result | Status], None, None]:
     """Run tasks on a Dask cluster, and yield the index and the result of each as it ends.
 
-    A task holds the arguments of `function`; `address` is that of the scheduler. A task whose
-    worker dies is given to another worker. After the deaths that the scheduler allows it gives
-    `Status.WORKER_DIED`. The setting is `distributed.scheduler.allowed-failures`, 3 by default. A
-    task that takes longer than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. The
-    scheduler holds `OUTSTANDING` tasks at most, which wait until a worker is free. An argument
-    `OnGpu` that successive tasks share is computed once. Without Dask, `MissingExtra` is raised;
-    without a scheduler at the address, `BadArgument`.
+    The result of a task is that of `function`, or a `Status` if it failed. A task holds the
+    arguments of `function`; `address` is that of the scheduler. A task whose worker dies is given
+    to another worker. After too many such deaths the task gives `Status.WORKER_DIED`. The
+    scheduler's setting `distributed.scheduler.allowed-failures`, 3 by default, is their number. A
+    task that takes longer than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. At most
+    10 000 tasks (`OUTSTANDING`) are given to the scheduler at once; they wait there for a free
+    worker. An argument `OnGpu` that successive tasks share is computed once. Without Dask,
+    `MissingExtra` is raised; without a scheduler at the address, `BadArgument`.
     """
     try:
         from distributed import CancelledError, Client, Event, KilledWorker, as_completed

@@ -54,7 +54,9 @@ class Campaign(NamedTuple):
 
     @property
     def meta(self) -> dict[str, str]:
-        """The metadata of each shard: hash of the request, and package versions as JSON."""
+        """The metadata of each shard, a file of the data set: hash of the request, and package
+        versions as JSON.
+        """
         digest = hashlib.sha256(self.text.encode()).hexdigest()
         return {"campaign": digest, "versions": json.dumps(self.asked["versions"])}
 
@@ -65,12 +67,13 @@ def carry_out(
     work: Work,
     observer: Callable[[JobRow], object] = lambda row: None,
 ) -> GraspShards:
-    """Run the jobs that a folder lacks, and write its data set, which is returned.
+    """Run the jobs of a campaign that are not yet in its `folder`. Write its data set there, and
+    return it.
 
-    `work` runs jobs, given their indices. As each job ends, it yields the job's place among these
-    indices. With it come the bytes of its shard or a failure. `observer` is called with the
-    `JobRow` of each finished job. Raises `OutputError` if the folder holds another campaign or
-    other files.
+    `work` is a function that runs jobs, given their indices. As each job ends, it yields a pair.
+    First is the job's position among these indices. Second are the bytes of the job's shard file,
+    or a `Status` if it failed. `observer` is called with the `JobRow` of each finished job. Raises
+    `OutputError` if the folder holds another campaign or other files.
     """
     with hold_folder(folder):
         begin_folder(folder / ASKED, campaign.text, "campaigns")
@@ -187,7 +190,7 @@ class _Store:
 
 
 def card_of(campaign: Campaign, rows: Sequence[JobRow], digests: list[str]) -> dict[str, Any]:
-    """Return the content of `card.json`.
+    """Return the content of `card.json`, the summary of a campaign's data set.
 
     `rows` are the outcomes of all jobs, and `digests` the SHA-256 of each shard in hexadecimal
     digits.

@@ -27,7 +27,9 @@ PACKAGES = ("torchgrasp", "torch", "numpy", "scipy", "trimesh", "sapien", "mujoc
 
 
 def versions() -> dict[str, str]:
-    """Return the installed versions of `PACKAGES`; "none" for a package that is not installed."""
+    """Return the installed versions, by name, of torchgrasp and the packages that may change a
+    campaign's results (`PACKAGES`). "none" means that a package is not installed.
+    """
     from torchgrasp import __version__
 
     found: dict[str, str] = dict.fromkeys(PACKAGES, "none")
@@ -41,7 +43,7 @@ def versions() -> dict[str, str]:
 def check_versions(meta: dict[str, str]) -> None:
     """Raise `BadArgument` unless this machine has the software with which the campaign began.
 
-    `meta["versions"]` holds the versions at its start as JSON.
+    `meta["versions"]` holds the versions of the packages at the campaign's start, as JSON.
     """
     here = json.dumps(versions())
     if here != meta["versions"]:
@@ -49,7 +51,8 @@ def check_versions(meta: dict[str, str]) -> None:
 
 
 def plan_jobs(meta: dict[str, str], *task: Any) -> list[Grasps | None]:
-    """Return the executable grasps of several jobs, None for a job that could not be planned.
+    """Return the executable grasps of several jobs, those that passed all checks; None for a job
+    that could not be planned.
 
     `task` holds the arguments of `plan_views`. Raises `BadArgument` on a machine whose software
     differs from `meta["versions"]`.
@@ -71,10 +74,10 @@ def run_job(
 
     `protocol` is the test of each grasp, and `spec` says which grasps are tried. `meta` holds the
     `versions` of the software with which the campaign began. Every machine must have them, and the
-    same hand. `plans` is what `plan_jobs` returned, and the job's plan is `plans[place]`. If it is
-    no list, the job is planned here. This is None, or the `Status` of a planning that took too
-    long. A faulty object gives a `JobRow` with the reason. Errors that are not the object's fault
-    are raised.
+    same hand. If `plans` is the list that `plan_jobs` returned, the job's plan is `plans[place]`.
+    If `plans` is None, or the `Status` of a planning that took too long, the job is planned here. A
+    faulty object gives a `JobRow` with the reason. Errors that are not the object's fault are
+    raised.
     """
     check_versions(meta)
     hand = view.load_hand()
@@ -126,7 +129,7 @@ def _work(
 
 
 def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
-    """Return the shard of a job that has neither a cloud nor grasps.
+    """Return the data (`Shard`) of a job that has neither a cloud nor grasps.
 
     `row` is its outcome, and `draws` the number of trials of each grasp in the campaign.
     """

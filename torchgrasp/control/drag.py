@@ -29,35 +29,47 @@ class DragControlNumbers:
     """Parameters of the controller of a drag."""
 
     agree: float = 1e-3
-    """Greatest distance [m] of a plan's feet from the lowest points of the hand's fingertips."""
+    """Greatest distance [m] between a plan's contact points (`feet`) and the lowest points of the
+    fingertips. Beyond it, the plan is that of another hand.
+    """
     height: float = 0.05
-    """Height [m] above the object at which the hand starts and ends: that of its checked path."""
+    """Height [m] above its planned pose at which the hand starts and ends. The plan's path is
+    checked for collisions from this height.
+    """
     fastest: float = 0.05
     """Greatest speed [m/s] of the palm on its way down."""
     near: float = 0.01
-    """Height [m] from which the palm comes down slowly: the object may be higher than planned."""
+    """Height [m] above the planned pose below which the palm comes down slowly: the object may be
+    higher than planned.
+    """
     gain: float = 0.003
     """Speed [m/s] of the palm for each newton that the pressing force is off."""
     touching: float = 0.01
     """Greatest speed [m/s] of the palm while it presses."""
     pressed: float = 0.9
-    """Share of the wanted force from which the hand moves along."""
+    """Share of the wanted pressing force above which the hand begins to move along."""
     felt: float = 0.4
-    """Sum of the forces [N] from which the tips touch: three deviations of the noise of two."""
+    """Sum of the fingertips' normal forces [N] above which they count as touching. It is three
+    standard deviations of the noise of two fingertips.
+    """
     below: float = 0.005
-    """Depth [m] under the table to which the tips are sent: the table may be lower than planned."""
+    """Depth [m] under the table to which the fingertips are sent: the table may be lower than
+    planned.
+    """
     deepest: float = 0.03
     """Depth [m] below the planned pose at which a hand that presses too little gives up."""
     patience: float = 3.0
     """Time [s] of pressing after which the hand gives up."""
     lost: float = 0.2
-    """Time [s] without a force on the way, after which the object is lost."""
+    """Time [s] without a force on the fingertips, during the drag, after which the object counts as
+    lost.
+    """
     speed: float = 0.06
     """Mean speed [m/s] of the drag: friction is then far above inertia."""
     lag: float = 0.02
-    """Greatest lag [m] of the tips behind the palm that the palm makes up for."""
+    """Greatest lag [m] of the fingertips behind the palm that the palm makes up for."""
     catching: float = 0.03
-    """Greatest speed [m/s] at which it does so."""
+    """Greatest speed [m/s] at which the palm makes up for this lag."""
     rise: float = 0.1
     """Mean speed [m/s] at which the hand rises."""
 
@@ -131,11 +143,12 @@ class DragController:
 
     @checked
     def step(self, observation: Observation, period: Annotated[float, Range(1e-5, 1.0)]) -> Targets:
-        """Return the targets of joints and palm for the next tick.
+        """Return the targets of joints and palm for the next control tick, the time until the next
+        call.
 
         Args:
             observation: what the hand measures now.
-            period: time [s] until the next tick, 1e-5 to 1.
+            period: time [s] until the next control tick, 1e-5 to 1.
 
         Raises `BadArgument` for a period outside 1e-5 to 1 s.
         """

@@ -45,14 +45,15 @@ class PreferredForces(Value):
 class ForcePreference(Protocol):
     """A model of preferred finger forces, such as a model of stability.
 
-    Of balanced forces that need almost the least friction, those nearest to its preference are
-    taken.
+    Several sets of balanced forces may need almost the least friction. Of these, the one nearest to
+    the preferred forces is taken.
     """
 
     def preferred_forces(
         self, tips: Float[Tensor, "3 3"], force: Positive | None = None
     ) -> PreferredForces:
-        """Return the forces preferred for fingertips with given centres `tips` [m].
+        """Return the preferred normal forces of three fingertips with centres `tips` [m], in any
+        frame.
 
         `force` [N] is the normal force of the finger that presses hardest; with None the model
         chooses it.
@@ -72,15 +73,16 @@ def desired_forces(
     `points` [m] and outward unit `normals` are those of the f contacts, in any frame. The forces
     are in the same frame. The largest normal force is `strongest` [N]. `preferred` holds wanted
     normal forces of the fingers, of which only the ratios count; None means equal ones. Where no
-    balanced forces press at every contact, each force is `strongest` along the inward normal.
+    balanced forces press at every contact, each force is `strongest` along the inward normal. `*b`
+    stands for any leading axes.
     """
     balanced = least_friction_forces(points, normals, strongest, preferred)
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
 
 
 def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tensor, "g f 3"]]:
-    """Return the planned contacts of g grasps in the hand's frame: first the points [m], then the
-    outward unit normals.
+    """Return the f planned contacts of each of g grasps: first the points [m], then the outward
+    unit normals. Their frame is that of the hand's root link.
     """
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     points = apply(hand_from_obj, grasps.contacts.points.double())
@@ -147,11 +149,11 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
 
 
 def check_same_hand(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` if grasps are not the hand's: by its name, their fingers or joints, or
-    where their joints place its fingertips.
+    """Raise `BadArgument` if `grasps` were planned for another hand than `hand`.
 
-    Grasps whose metadata name no hand, fingers or joints need only the number of each. The places
-    are compared if the files of the hand are not those of the plan.
+    The names of hand, fingers and joints in `grasps.meta` must be those of `hand`. Where
+    `grasps.meta` lacks the names, only the numbers of fingers and joints are compared. If the files
+    of the hand have changed since the plan, its fingertips must still reach the planned contacts.
     """
     planned = grasps.meta.get("hand", hand.name)
     if planned != hand.name:
@@ -200,13 +202,13 @@ def press(
     forces: Float[Tensor, "g f 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
-    """Return the joint targets and torques with which position-controlled drives exert given
-    forces.
+    """Return the joint targets and torques with which position-controlled drives exert the `forces`
+    in g grasps.
 
-    `joints` [rad] are the present actuated joints, and `jacobian` [m/rad] is that of the contact
-    points by them. `forces` [N] act on the object, in the frame of the Jacobian. `stiffness`
-    [N m/rad] is that of each actuated joint. For sliding joints, metres replace radians, and
-    newtons replace newton metres.
+    `joints` [rad] are the present positions of the h actuated joints. `jacobian` [m/rad] is that of
+    the f contact points by these joints. `forces` [N] act on the object, in the frame of the
+    Jacobian. `stiffness` [N m/rad] is that of each actuated joint. For sliding joints, metres
+    replace radians, and newtons replace newton metres.
     """
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)
@@ -220,7 +222,8 @@ def tip_compliance(
     """Return the compliance [m/N] of each fingertip along its contact normal.
 
     `jacobian` [m/rad] is that of the contact points by the h actuated joints, whose `stiffness` [N
-    m/rad] is given. `normals` are unit vectors.
+    m/rad] is given. `normals` are unit vectors in the frame of the Jacobian. f counts fingertips,
+    and `*b` stands for any leading axes.
     """
     along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
     return (along**2 / stiffness).sum(-1)

@@ -25,17 +25,21 @@ class FrictionNumbers:
     mean: float = 0.8
     """Estimate at the start, if the grasp was planned for a single coefficient."""
     std: float = 0.2
-    """Standard deviation of this estimate."""
+    """Standard deviation of this first estimate."""
     least_std: float = 0.03
-    """Least standard deviation of the estimate; larger: it follows later readings more."""
+    """Lower bound of the estimate's standard deviation. With a larger bound, later readings change
+    the estimate more.
+    """
     least: float = 0.15
     """Lower bound of the coefficient at the start; a finger that sticks raises it."""
     most: float = 1.5
     """Largest coefficient that is estimated."""
     noise: float = 0.4
-    """Standard deviation [N] of a fingertip's force; over the normal force, that of the ratio."""
+    """Standard deviation [N] of a fingertip's force. Divided by the normal force, it is that of the
+    ratio of tangential to normal force.
+    """
     sure: float = 2.0
-    """Standard deviations within which a coefficient is likely."""
+    """Number of standard deviations within which a coefficient is likely."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +47,7 @@ class FeltLoadNumbers:
     """Parameters of `LoadEstimate`, the running estimate of the load."""
 
     lifted: float = 0.35
-    """Load [N] from which the object counts as lifted."""
+    """Force [N] on the fingertips above which the object counts as lifted."""
     cutoff: float = 3.0
     """Cut-off frequency [Hz] of the low-pass filter of the sensed load."""
     carried: float = 0.7
@@ -69,9 +73,11 @@ class WeightNumbers:
     noise: float = 0.5
     """Standard deviation [N] of the load that the fingertips feel in one tick."""
     share: float = 0.05
-    """Standard deviation of the mean load by motion and oblique contacts, as a share of it."""
+    """Standard deviation of the mean load that motion and oblique contacts cause, as a share of
+    this load.
+    """
     sure: float = 2.0
-    """Standard deviations within which a mass is likely."""
+    """Number of standard deviations within which a mass is likely."""
     most: float = 10.0
     """Largest mass [kg] of an object."""
 
@@ -88,8 +94,8 @@ class FrictionEstimate:
     coefficient. `most` is the largest coefficient that is believed.
 
     Args:
-        prior: the coefficient that the grasp was planned for. A distribution gives mean and
-            deviation at the start; with a number they are those of `FRICTION`.
+        prior: the coefficient that the grasp was planned for. A `Distribution` gives `mean` and
+            `std` at the start. With a number, `mean` starts at 0.8 and `std` at 0.2.
     """
 
     def __init__(self, prior: float | Distribution) -> None:
@@ -129,10 +135,10 @@ class FrictionEstimate:
 
     @property
     def posterior(self) -> Distribution:
-        """The prior, cut where fingertips have stuck or slid.
+        """The distribution of the friction coefficient: the prior, within bounds from the touches.
 
-        A fingertip that sticks bounds the coefficient below; one that slides bounds it above. Where
-        the prior excludes what is left, the touches alone decide.
+        A fingertip that sticks bounds the coefficient below; one that slides bounds it above. If
+        the prior excludes all values within these bounds, the bounds alone count.
         """
         around = FRICTION.sure * self.std
         high = self.mean + around if self.slid else math.inf
@@ -151,12 +157,14 @@ class FrictionEstimate:
 class LoadEstimate:
     """A running estimate of the load with which the object bears on the fingertips.
 
-    `wrench` (6,) is the filtered load, and `carried` (6,) the part of it that changes slowly. Once
-    the lifted load has been steady (`settles`), it is weighed.
+    A load is a wrench (6,): force [N], then torque [N m] about the contacts' centroid, in the
+    hand's frame. `wrench` (6,) is the low-passed load, and `carried` (6,) the part of it that
+    changes slowly. Once the lifted load has been steady (`settles`), its mean force gives the mass.
 
     Args:
-        up: unit normal (3,) of the table; None means that every load may be the object's.
-        push: force [N] by which something else may push at the lifted object, at most.
+        up: unit normal (3,) of the table in the hand's frame. The object's weight acts against it.
+            None means that the whole load may be due to the object.
+        push: largest force [N] by which something else may push at the lifted object.
     """
 
     def __init__(self, up: np.ndarray | None, push: float) -> None:
@@ -171,7 +179,9 @@ class LoadEstimate:
         self.weighings = 0  # ticks in this mean
 
     def update(self, felt: np.ndarray, period: float) -> None:
-        """Update the estimate by the wrench `felt` (6,) in a tick of `period` [s]."""
+        """Update the estimate by the wrench `felt` (6,) [N, N m] that the fingertips sense in a
+        control period of `period` [s].
+        """
         load = self._possible(felt)
         self.wrench = smooth(self.wrench, load, LOAD.cutoff, period)
         self.carried = smooth(self.carried, load, LOAD.carried, period)
@@ -180,9 +190,10 @@ class LoadEstimate:
             self.weighed = self.weighed + (load[:3] - self.weighed) / self.weighings
 
     def settles(self, period: float) -> bool:
-        """Return whether the object is lifted, and its load has not grown for `LOAD.steady`.
+        """Return whether the object is lifted, and its load has not grown for 0.3 s
+        (`LOAD.steady`).
 
-        The call adds a tick of `period` [s].
+        Call it once in each control period of `period` [s]: the call adds this time.
         """
         if self.weight > LOAD.growth * self.most:
             self.most = self.weight
@@ -194,12 +205,14 @@ class LoadEstimate:
 
     @property
     def weight(self) -> float:
-        """Size [N] of the filtered force."""
+        """Size [N] of the low-passed force."""
         return float(np.linalg.norm(self.wrench[:3]))
 
     @property
     def mass(self) -> Distribution | None:
-        """The mass [kg] that the weighed load shows; None if none was weighed."""
+        """The `Distribution` of the object's mass [kg], from the mean of the steady load. None if
+        no load was steady yet, or the object is no longer lifted.
+        """
         load = float(np.linalg.norm(self.weighed))
         if min(load, self.weight) < LOAD.lifted:
             return None
@@ -210,7 +223,9 @@ class LoadEstimate:
 
     @property
     def exceeded(self) -> Distribution:
-        """The mass [kg] of an object that is heavier than the largest load so far."""
+        """The `Distribution` of the mass [kg] of an object that is heavier than the largest load so
+        far.
+        """
         carried = (1 - WEIGHT.sure * WEIGHT.share) * self.most / GRAVITY
         return Distribution.between(min(carried, WEIGHT.most), WEIGHT.most)
 
@@ -231,8 +246,8 @@ def likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:
     [N].
 
     The weight is that of water in the volume of the estimated surface. Without a surface, a ball as
-    wide as the contacts replaces it. It is at least that of `WEIGHT.mass`: a small thing may be of
-    metal.
+    wide as the contacts replaces it. It is at least that of 0.4 kg (`WEIGHT.mass`): a small thing
+    may be of metal.
     """
     field = reference.surface
     points = reference.gains.target

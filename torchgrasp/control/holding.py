@@ -37,13 +37,15 @@ class GripNumbers:
     least_push: float = 0.4
     """Least normal force [N] of a finger: four standard deviations of its reading."""
     planned: float = 0.01
-    """Least planned force of a finger, as a share of the largest."""
+    """Least planned normal force of a finger, as a share of the largest finger's force."""
     fastest: float = 60.0
     """Largest rate [N/s] of a fingertip's force."""
     room: float = 0.8
-    """Share of the largest force up to which least normal forces are demanded of the fingers."""
+    """Upper bound of the least normal force that is demanded of a finger, as a share of its largest
+    force.
+    """
     near: float = 0.95
-    """Share of the limits of torque and force from which the forces count as near the limits."""
+    """Share of the limits of torque and force above which the forces count as near the limits."""
     normals: float = 1.0
     """Cut-off frequency [Hz] of the low-pass filter of the sensed normals."""
     forces: float = 8.0
@@ -53,7 +55,7 @@ class GripNumbers:
     ever growing forces.
     """
     settled: float = 0.4
-    """Time [s] before which the hand may still reopen beside the object."""
+    """Time [s] after the start of the hold in which the hand may still reopen."""
     sure: float = 4.0
     """Rate [1/s] at which the reserve for a push grows after the time `settled`."""
     slow: float = 0.008
@@ -124,10 +126,11 @@ def keep_targets(
 
 
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
-    """Return the common `factor` (no unit) on all forces one tick of `period` [s] later.
+    """Return the common `factor` (no unit) on all forces after another control period of `period`
+    [s].
 
-    It is `factor` + `period` (1 - s / `strength`), clamped to [0.5, `MAX_FACTOR`]. So the sum s [N]
-    of the sensed normal forces approaches `strength` [N].
+    It is `factor` + `period` (1 - s / `strength`), clamped to [0.5, 1.5]. So the sum s [N] of the
+    sensed normal forces approaches `strength` [N].
     """
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
     return min(max(factor + period * lacking, 0.5), MAX_FACTOR)
@@ -136,8 +139,8 @@ def regulate(factor: float, observation: Observation, strength: float, period: f
 def held_forces(
     reference: ClosingReference, observation: Observation
 ) -> tuple[Float[Tensor, "f 3"], float]:
-    """Return balanced forces [N] on the object in the hand's frame, and the sum [N] of their normal
-    parts.
+    """Return balanced forces [N] of f fingertips on the object in the hand's frame, and the sum [N]
+    of their normal parts.
 
     The sum is over fingertips with a working sensor. The forces act at the sensed contacts, and
     their total wrench is zero. The planned forces are returned if a finger does not touch, or if no
@@ -163,12 +166,13 @@ def held_forces(
 
 class GripHold:
     """Hold controller that presses with the least forces against two loads. They are the sensed
-    load and a push of `PUSH` from any side.
+    load and a push of 2.5 N (`PUSH`) from any side.
 
     Until the lifted load is steady, the forces also allow for the greatest weight that an object of
     this size may have. This reserve shrinks where torques or forces would exceed their limits; no
     force exceeds `reference.max_force`. `status` becomes `TOO_HEAVY` when a fingertip slides
-    although the torques or forces have reached their limits.
+    although the torques or forces have reached their limits. A load is a force [N] and a torque [N
+    m] about the contacts' centroid.
 
     Args:
         reference: the closing plan.
@@ -216,7 +220,8 @@ class GripHold:
 
     @property
     def mass(self) -> Distribution | None:
-        """The mass [kg] that the steady load shows, while nothing else pushes at the object.
+        """The `Distribution` of the object's mass [kg], from the steady load, while nothing else
+        pushes at the object.
 
         None if no load is steady. A load that is too heavy bounds the mass below.
         """
@@ -345,9 +350,10 @@ def push_reserve(
     """Return the extra normal force (f,) [N] of each finger against a push of 1 N from the worst
     side.
 
-    With it, the force of the finger stays in its cone of the coefficient `friction`. The push acts
-    at `arm` (3,) [m] from the centroid of the `contacts`, whose outward unit `normals` are (f, 3).
-    The fingers share the push like springs of equal stiffness.
+    With it, the force of the finger stays within the cone of the coefficient `friction`. The push
+    acts at `arm` (3,) [m] from the centroid of the `contacts`. `normals` (f, 3) are their outward
+    unit normals. All vectors are in one frame. f counts fingers. The fingers share the push like
+    springs of equal stiffness.
     """
     sides = np.eye(3)
     pushes = np.concatenate([sides, np.cross(arm, sides).T])  # (6, 3): wrenches

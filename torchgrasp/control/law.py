@@ -37,7 +37,8 @@ def surface_covariance(
     s^2 + floor^2 I.
 
     n is the contact's normal, from `normals`, and s its standard deviation `std_m` [m]. The floor
-    is `POSITION_FLOOR` [m], of the hand's own errors, which are equal in all directions.
+    of 5 mm (`POSITION_FLOOR`) covers the hand's own errors, which are equal in all directions. `*b`
+    stands for any leading axes.
     """
     return _normal_covariance(normals, std_m, POSITION_FLOOR)
 
@@ -48,8 +49,8 @@ def printed_covariance(
     """Return the covariance [m^2] that Eq. (27) of the paper prints: Sigma_cov = diag(|R f_cov n|).
 
     `distance_variance` [m^2] is f_cov, the variance of the signed distance. `normals` are R n, in
-    the hand's frame. A normal across an axis makes Sigma_cov singular, so each entry is at least
-    the square of `PRINTED_FLOOR`.
+    the hand's frame. A normal across an axis makes Sigma_cov singular. So each diagonal entry is at
+    least (0.1 mm)^2 (`PRINTED_FLOOR`). `*b` stands for any leading axes.
     """
     entries = (distance_variance[..., None] * normals).abs()
     return torch.diag_embed(entries.clamp_min(PRINTED_FLOOR**2))
@@ -63,8 +64,9 @@ def force_covariance(
     """Return the covariance [N^2] of each contact force (Sigma_fd, Eq. 28 of the paper).
 
     It is the variance of the normal force along the normal, plus the sensor's variance, equal in
-    all directions. `forces` [N] are the desired ones, and `normals` those of the contacts.
-    `deviation` [N] is the standard deviation of each normal force; None means a tenth of the force.
+    all directions. `forces` [N] are the desired forces, and `normals` the unit normals of the
+    contacts, in the same frame. `*b` stands for any leading axes. `deviation` [N] is the standard
+    deviation of each normal force; None means a tenth of the force.
     """
     if deviation is None:
         deviation = FORCE_SHARE * dot(forces, normals)
@@ -86,17 +88,19 @@ def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> 
     2), Eq. (26).
 
     `error` [m] is e, from the fingertip to its contact, and `covariance` [m^2] is Sigma_cov. The
-    share is 1 at the contact, and near 0 where the error exceeds the shape's uncertainty.
+    share is 1 at the contact, and near 0 where the error exceeds the shape's uncertainty. Both are
+    in one frame. `*b` stands for any leading axes.
     """
     factor = cholesky(covariance, "the covariance of a contact", "add an isotropic floor")
     return torch.exp(-0.5 * squared_mahalanobis(error, factor))
 
 
 def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the position gain [1/s] on each axis: a constant over the axis's variance, Eq. (27) of
-    the paper.
+    """Return the position gain [1/s] on each axis: a constant divided by the axis's variance, Eq.
+    (27) of the paper.
 
-    `covariance` [m^2] is that of the contact's position.
+    The gain is 4 / s (`POSITION_RATE`) at a standard deviation of 5 mm (`POSITION_FLOOR`).
+    `covariance` [m^2] is that of the contact's position. `*b` stands for any leading axes.
     """
     return POSITION_RATE * POSITION_FLOOR**2 / covariance.diagonal(dim1=-2, dim2=-1)
 
@@ -105,9 +109,9 @@ def force_gain(
     covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"] | float
 ) -> Float[Tensor, "*b 3"]:
     """Return the force gain [m/(s N)] on each axis, Eq. (28) of the paper. It is `alpha_f` [m N/s]
-    over the axis's variance.
+    divided by the axis's variance.
 
-    `covariance` [N^2] is that of the contact force.
+    `covariance` [N^2] is that of the contact force. `*b` stands for any leading axes.
     """
     diagonal = covariance.diagonal(dim1=-2, dim2=-1)
     return alpha_f[..., None] / diagonal if isinstance(alpha_f, Tensor) else alpha_f / diagonal
@@ -116,8 +120,9 @@ def force_gain(
 def damped_inverse(
     jacobian: Float[Tensor, "*b m h"], damping: float = DAMPING
 ) -> Float[Tensor, "*b h m"]:
-    """Return the damped inverse J^T (J J^T + damping I)^-1 of a `jacobian` [m/rad]; `damping` is in
-    m^2.
+    """Return the damped inverse J^T (J J^T + damping I)^-1 of a `jacobian` [m/rad], in rad/m.
+    `damping` is in m^2, m counts coordinates of points, and h counts joints. `*b` stands for any
+    leading axes.
     """
     m, h = jacobian.shape[-2:]
     eye = torch.eye(min(m, h), dtype=jacobian.dtype, device=jacobian.device)
@@ -140,8 +145,9 @@ def tip_velocity(
 ) -> Float[Tensor, "*b 3"]:
     """Return the commanded velocity [m/s] of each fingertip, the bracket in Eq. (25) of the paper.
 
-    It is (1 - lambda) K_P e_x + lambda C_F e_f, shortened to at most `MAX_SPEED`. Here e_x and e_f
-    are the errors of position and of force.
+    It is (1 - lambda) K_P e_x + lambda C_F e_f, shortened to at most 0.04 m/s (`MAX_SPEED`). Here
+    e_x and e_f are the errors of position and of force. All vectors are in one frame. `*b` stands
+    for any leading axes, of which the last is that of the fingers.
 
     Args:
         position_error: e_x, from each fingertip to its contact [m].
@@ -166,8 +172,9 @@ def stay_above(
 ) -> Float[Tensor, "*b 3"]:
     """Return each fingertip's `velocity` [m/s], limited so that no fingertip enters the table.
 
-    Its component along the table's unit normal `up` is raised to at least -`POSITION_RATE` h with
-    h = max(`height`, 0). The `height` [m] is that of each fingertip's lowest point over the table.
+    Its component along the table's unit normal `up` is raised to at least -r h. Here r is 4 / s
+    (`POSITION_RATE`), and h = max(`height`, 0). The `height` [m] is that of each fingertip's lowest
+    point over the table. Velocities and `up` are in one frame. `*b` stands for any leading axes.
     """
     lacking = -POSITION_RATE * height.clamp_min(0.0) - velocity @ up
     return velocity + lacking.clamp_min(0.0)[..., None] * up
@@ -180,16 +187,17 @@ def joint_step(
     posture_error: Float[Tensor, "*b h"] | None = None,
     damping: float = DAMPING,
 ) -> Float[Tensor, "*b h"]:
-    """Return the change [rad] of the actuated joints in one tick that moves the fingertips with a
-    `velocity` [m/s].
+    """Return the change [rad] of the actuated joints in one control period that moves the
+    fingertips with a `velocity` [m/s].
 
     Damped least squares over all fingers replace the inverse Jacobian in Eq. (25) of the paper,
-    which coupled fingers lack. No joint changes by more than `MAX_STEP`.
+    which coupled fingers lack. No joint changes by more than 0.05 rad (`MAX_STEP`). `*b` stands for
+    any leading axes.
 
     Args:
         jacobian: Jacobian [m/rad] of the f fingertips with respect to the h actuated joints.
-        velocity: commanded velocity of each fingertip.
-        period: period of the tick [s].
+        velocity: commanded velocity [m/s] of each fingertip, in the frame of the Jacobian.
+        period: control period [s].
         posture_error: planned minus present joints [rad]. The motions that leave the fingertips at
             rest reduce it; None means that there are no such motions.
         damping: damping of the inverse [m^2].

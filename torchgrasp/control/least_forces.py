@@ -34,13 +34,15 @@ class BarrierNumbers:
     penalty: float = 500.0
     """Weight [N] of the penalty on joint torques and normal forces."""
     knee: float = 0.9
-    """Share of their limits where the penalty begins."""
+    """Share of the limits of torque and force above which the penalty begins."""
     gap: float = 0.01
     """Weight of the barrier, as a share of the load and the floors [N]. With a larger one the
     forces stay farther from the borders of the cones.
     """
     growth: float = 0.02
-    """Least multiple of the internal forces that is tried besides 0; each next one is twice it."""
+    """Least multiple of the internal forces that is tried besides 0; each later one is twice the
+    one before.
+    """
     growths: int = 9
     """Number of these multiples."""
     margin: float = 1.25
@@ -54,9 +56,12 @@ class BarrierNumbers:
     solved: float = 0.3
     """Newton decrement at which the steps end."""
     lower: float = 0.5
-    """Share of the found normal force to which a floor is lowered if no forces reach the floor."""
+    """If no forces reach a finger's least normal force (its floor), the floor is lowered. It
+    becomes this share of the normal force that was found.
+    """
     raised: float = 1.05
-    """Ratio of a raised friction coefficient to the least with which forces were found."""
+    """Ratio of a raised friction coefficient to the least coefficient with which forces were found.
+    """
     rank: float = 1e-12
     """Least singular value of a grasp map, as a share of the largest; contacts on one line have
     rank 5.
@@ -90,8 +95,8 @@ class Balance(NamedTuple):
 
 
 def balance(points: Float[Array, "f 3"], touching: Bool[Array, "f"] | bool = True) -> Balance:
-    """Return the grasp map at contact `points` [m], its pseudo-inverse and its null space, from one
-    SVD.
+    """Return the grasp map at f contact `points` [m], its pseudo-inverse and its null space, from
+    one SVD.
 
     The forces that it maps are in the frame of the points. `touching` marks the fingers that touch;
     True means all.
@@ -108,7 +113,8 @@ def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -
     """Return each finger's ratio of tangential to normal force; it is infinite if the finger does
     not press.
 
-    `forces` [N] act on the object, and `normals` are outward unit vectors, both in one frame.
+    `forces` [N] act on the object, and `normals` are outward unit vectors, both in one frame. f
+    counts fingers.
     """
     push = -(forces * normals).sum(-1)
     slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)
@@ -121,8 +127,8 @@ class LeastForces:
 
     Args:
         start: forces (f, 3) [N] on the object from which the first call starts; they press at every
-            contact.
-        effort: largest torque [N m] of each of the j joints of the URDF.
+            contact, in the frame of all later vectors.
+        effort: largest torque (j,) [N m] of each of the j joints of the URDF.
         most: largest normal force [N] of each finger.
     """
 
@@ -142,7 +148,8 @@ class LeastForces:
         floor: Float[Array, "f"],
         reserve: Float[Array, "f"] | float = 0.0,
     ) -> Float[Array, "f 3"]:
-        """Return the least forces [N] on the object that exert the wrench `load`.
+        """Return the least forces [N] on the object that exert the wrench `load`. All vectors are
+        in one frame.
 
         If no forces satisfy the constraints, the friction coefficient is raised to the least with
         which forces were found. The coefficient is also at least 1.25 times the one that the
@@ -200,7 +207,7 @@ class LeastForces:
         jacobian: Float[Array, "f 3 j"],
     ) -> float:
         """Return the largest ratio of a joint torque or a normal force to its limit, for given
-        forces [N].
+        `forces` [N]. The limits are `effort` and `most`.
 
         `normals` are outward unit vectors, and `jacobian` [m/rad] is that of the fingertips by all
         joints.

@@ -25,8 +25,8 @@ from torchgrasp.values.specs import ClosingMode, HoldingMode
 
 
 def choose_preference(hand: Hand, mode: ClosingMode) -> ForcePreference | None:
-    """Return the model that chooses among balanced forces in a closing mode, or None if the mode
-    has none.
+    """Return the model by which a closing mode chooses among balanced forces; None if it has no
+    model.
 
     Raises `BadArgument` for the mode "paper" with a hand of other than three fingers.
     """
@@ -64,9 +64,9 @@ def choose_holding(
 ) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step] | None:
     """Return the function that makes a mode's hold controller, or None for the mode "law".
 
-    The function takes the plan, the last observation and the joint targets [rad] at the end of the
-    closing. With "law" the closing controller itself goes on to press. Raises `BadArgument` for
-    "impedance" with a hand of other than three fingers.
+    The function takes the plan, the last observation and the joint targets (j,) [rad] at the end of
+    the closing. j counts all joints of the URDF. With "law" the closing controller itself goes on
+    to press. Raises `BadArgument` for "impedance" with a hand of other than three fingers.
     """
     if mode == "impedance":
         hand.require_three("holding", "'impedance', whose virtual frame is of three,")

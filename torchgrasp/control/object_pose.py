@@ -22,8 +22,8 @@ from torchgrasp.geometry.linalg import across, unit
 
 @dataclasses.dataclass(frozen=True)
 class ContactPlaneNumbers:
-    """Parameters of `ContactPlanes`, above all its prior of the object's displacement before any
-    touch.
+    """Parameters of `ContactPlanes`. All but the last are of its prior: the object's displacement
+    before any touch.
     """
 
     shift: float = 0.01
@@ -35,7 +35,9 @@ class ContactPlaneNumbers:
     tilt: float = 0.01
     """Standard deviation [rad] of a tilt on the table."""
     missed: float = 0.025
-    """Largest distance [m] of a finger beyond its plane that counts: farther, it has missed."""
+    """Largest distance [m] by which a finger counts as beyond its contact's plane. A finger that is
+    farther beyond has missed the object.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,9 +47,10 @@ class LocalizationNumbers:
     turns: tuple[float, ...] = (-0.24, -0.12, 0.0, 0.12, 0.24)
     """Rotations [rad] about the table's normal that are tried."""
     fine_turns: tuple[float, ...] = (-0.06, 0.0, 0.06)
-    """Rotations [rad] that are then tried, relative to the best of them."""
+    """Rotations [rad] that are tried afterwards, relative to the best of `turns`."""
     pitch: float = 0.006
-    """Distance [m] between the shifts that are tried; the fine search has a quarter of it."""
+    """Distance [m] between the shifts that are tried; in the fine search it is a quarter of this.
+    """
     farthest: float = 0.072
     """Largest shift [m] on each of two axes along the table that is tried."""
     shift: float = 0.03
@@ -61,13 +64,14 @@ class LocalizationNumbers:
     gap: float = 0.001
     """Least distance [m] between the surface and a fingertip in the air."""
     worst: float = 20.0
-    """Largest cost of one fingertip, so that a wrong touch does not decide."""
+    """Largest cost (no unit) of one fingertip, so that a wrong touch does not decide."""
     older: float = 4.0
     """Growth of the variance of a touch with each later touch, as a multiple of its own variance. A
     touch moves the object by twice the surface's deviation.
     """
     empty: float = 80.0
-    """Cost of a pose at which the hand would have touched the object, if it touched nothing."""
+    """Cost (no unit) of a pose at which a hand that touched nothing would have touched the object.
+    """
 
 
 PLANES = ContactPlaneNumbers()
@@ -81,8 +85,8 @@ class ContactPlanes:
     A fingertip that touches measures how far its contact's plane has moved along the normal. The
     measurement has the variance of the shape. A fingertip beyond its plane that touches nothing
     bounds this distance. The estimate is the most probable displacement under a Gaussian prior, in
-    the planned hand's frame. The prior has the mean `expected` (6,) [m, rad]; None means a mean of
-    0.
+    the planned hand's frame. The prior has the mean `expected` (6,): translation [m] of the
+    contacts' centroid, then rotation vector [rad]. None means a mean of 0.
     """
 
     def __init__(
@@ -126,7 +130,7 @@ class ContactPlanes:
         return found
 
     def moved(self, displacement: Float[Tensor, "6"]) -> Float[Tensor, "f 3"]:
-        """Return the planned contact points [m] after a `displacement` (6,) [m, rad] of the object.
+        """Return the planned contact points (f, 3) [m] after a `displacement` (6,) of the object.
 
         Both are in the frame of the planned hand.
         """
@@ -156,8 +160,8 @@ class Touches:
 
     `known` marks fingertips with a working sensor, `felt` marks fingertips that touch and have
     reported where. `links` (m, 4) holds centres and radii [m] of the collision spheres of links.
-    The drives have felt that one of them touches the object; None means that they felt none. If
-    `kept`, fingertips that no longer touch are also in `felt`.
+    The joint torques show that one of these links touches the object. None means that no link has
+    touched it. If `kept`, fingertips that no longer touch are also in `felt`. f counts fingertips.
     """
 
     def __init__(
@@ -209,8 +213,8 @@ class Touches:
 
 
 class Localization:
-    """Search for the object displacement that best explains the `touches`; each call tries one
-    rotation angle.
+    """Search for the object displacement that best explains a list of touches (`Touches`); each
+    call tries one rotation angle.
 
     Later touches weigh more, because each touch may move the object. If the hand touched nothing
     (`Touches.nothing`), the object is probably not where the hand closed. The plan `reference` must

@@ -24,8 +24,8 @@ all joints.
 
 @runtime_checkable
 class Closing(Protocol):
-    """A controller that closes the fingers; a call is a `Step`: it returns the next targets [rad]
-    of all joints.
+    """A controller that closes the fingers. Each call maps an observation and a period [s] to the
+    next targets (j,) [rad] of all joints of the URDF.
     """
 
     @property
@@ -42,7 +42,7 @@ class Closing(Protocol):
     def feels(self) -> bool:
         """Whether sensor readings change the targets.
 
-        If not, the targets press at the end, and no hold controller follows.
+        If not, the last targets already press on the object, and no hold controller follows.
         """
         ...
 
@@ -61,14 +61,17 @@ class LawClosing(Closing, Protocol):
         ...
 
     def press(self) -> Step:
-        """Return the function (`Step`) by which the same law presses, for each tick."""
+        """Return the function by which the same law presses. At each control period it maps an
+        observation and the period [s] to targets (j,) [rad] of all joints.
+        """
         ...
 
 
 class Settled:
-    """A clock of how long a closing has settled: `time` [s] for which all fingers have touched.
+    """A timer of how long a closing has settled: `time` [s] counts while all fingers touch.
 
-    With `pressing` they must also be under force control, with steady forces (`update`).
+    If `update` is called with `pressing`, they must also be under force control, with steady
+    forces.
     """
 
     def __init__(self, reference: ClosingReference) -> None:
@@ -83,12 +86,13 @@ class Settled:
         period: float,
         pressing: bool = True,
     ) -> None:
-        """Add a tick of `period` [s] to `time` if the closing is settled; otherwise set it to 0.
+        """Add a control period of `period` [s] to `time` if the closing is settled; otherwise set
+        `time` to 0.
 
         It is settled if all fingers touch. With `pressing`, each must also have a `share` of force
         control of at least 0.5, and a steady force. A force is steady if its average
-        (`TactileState.average`) changed by at most `NOISE` [N]. The change counts from the last
-        tick that was not settled. `touching` marks the fingers that touch.
+        (`TactileState.average`) changed by at most 0.1 N (`NOISE`). The change counts from the last
+        tick that was not settled. `touching` marks the fingers that touch. f counts fingers.
         """
         average = observation.tactile.average
         settled = bool(touching.all())
@@ -101,8 +105,8 @@ class Settled:
 
 
 def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
-    """Return the largest useful lead [rad] of each actuated joint: target minus position at the
-    largest torque of its drive.
+    """Return, for each of h actuated joints, the target minus position [rad] at which its drive
+    exerts its largest torque.
     """
     hand = reference.hand
     # infinite where nothing is driven: (j, h)

@@ -61,8 +61,8 @@ class GraspCheckNumbers:
     last: float = 0.3
     """Time [s] of pressing until which touches are averaged."""
     misplaced: float = 0.008
-    """Largest distance [m] between the displacements of object and palm in a secure grasp: twice
-    the estimate's error.
+    """Largest distance [m] between the translations of object and palm in a secure grasp: twice the
+    estimate's error.
     """
 
 
@@ -85,11 +85,11 @@ class LostNumbers:
     cutoff: float = 3.0
     """Cut-off frequency [Hz] of the low-pass filter of the load."""
     first: float = 0.01
-    """Least height [m] of the lift at which missing touches count."""
+    """Height [m] of the lift above which the object counts as lost if touches are missing."""
     low: float = 0.02
     """Height [m] of the lift up to which slides are summed."""
     slip: float = 0.0015
-    """Slide [m] of two fingertips beyond which the hand will lose the object."""
+    """Distance [m] that two fingertips each slide, beyond which the hand will lose the object."""
 
 
 APPROACH = ApproachNumbers()
@@ -99,9 +99,10 @@ LOST = LostNumbers()
 
 
 def can_guard(reference: ClosingReference) -> bool:
-    """Return whether the hand can stop at a touch.
+    """Return whether the hand can stop its approach at a touch.
 
-    The plan then has an approach, a table and a surface, and its fingertips are tactile.
+    It can if the plan `reference` has an approach, a table and a surface, and its fingertips are
+    tactile.
     """
     needed = reference.approach, reference.table, reference.surface
     return reference.sensor.kind == "tactile" and all(x is not None for x in needed)
@@ -125,9 +126,9 @@ class GuardedApproach:
         reference: the closing plan, with an approach, a table and a surface.
         options: options of the closing.
         length: distance [m] of the hand from its pre-grasp at the start.
-        felt: list to which the touches of each stop are appended.
-        after: the reopening of the hand, if it has closed before: it then starts at its pre-grasp,
-            and retreats first.
+        felt: list to which the touches of each stop (`Touches`) are appended.
+        after: the `Reopening` of a hand that has closed before. The hand then starts at its
+            pre-grasp, and retreats first. None means that it has not closed yet.
     """
 
     def __init__(
@@ -257,16 +258,17 @@ class GuardedApproach:
 class GraspCheck:
     """Check of a pressing grasp before the lift: `judged` becomes true when the result is known.
 
-    `secure` then says whether to lift. All fingers must touch, and the palm must have followed the
-    object (`CHECK.misplaced`). If all contact points are known, forces must balance with the
-    planned friction, of a distribution its mean. `displacement` (6,) holds the object's translation
-    [m] and rotation vector [rad] in the planned hand's frame. It is that of the closing. If the
-    plan has a table and a surface, it is estimated anew from all touches.
+    `secure` then says whether to lift. All fingers with a working sensor must touch. The palm must
+    have followed the object to within 8 mm (`CHECK.misplaced`). If all contact points are known,
+    balanced forces must exist within the planned friction cones. Of a distribution of friction, the
+    mean counts. `displacement` (6,) holds the object's translation [m] and rotation vector [rad] in
+    the planned hand's frame. It is the displacement that the closing estimated. If the plan has a
+    table and a surface, it is estimated anew from all touches.
 
     Args:
         reference: the closing plan.
-        displacement: displacement of the object [m, rad] that the closing estimated.
-        palm: displacement [m] of the palm from its planned pose.
+        displacement: displacement (6,) of the object that the closing estimated.
+        palm: displacement (3,) [m] of the palm from its planned pose.
         last: whether this is the last attempt, in which every grasp counts as secure.
         felt: all touches so far. The last ones are those of the closing; those of the pressing hand
             replace them.
@@ -341,8 +343,8 @@ class Reopening:
         displacement: displacement of the object in the planned hand's frame: translation [m],
             then rotation vector [rad].
         joints: measured positions [rad] of all joints.
-        palm: displacement of the closed hand's palm [m].
-        begun: displacement [m] of the palm at which the closing started.
+        palm: displacement (3,) [m] of the closed hand's palm from its planned pose.
+        begun: displacement (3,) [m] of the palm at which the closing started.
         reach: largest displacement [m] of the palm along the table; 0 means that the palm stays at
             `begun`.
     """
@@ -392,8 +394,8 @@ class LiftCheck:
 
     A tick is one period of the controller. Call the check at the end of each tick of the lift; the
     call returns `lost`. It takes three arguments. The first is an `Observation`. The second is the
-    height [m] of the hand above its place at the start of the lift. The third is the tick's length
-    [s].
+    height [m] of the hand above its position at the start of the lift. The third is the tick's
+    length [s].
 
     `lost` becomes true, and stays so, at the first of two events (bounds: `LOST`):
 
@@ -446,11 +448,11 @@ class LiftCheck:
 
 
 def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> Float[Tensor, "3"]:
-    """Return the palm's displacement [m] that follows the `shift` [m] of an object along the
-    `table`.
+    """Return the palm's displacement (3,) [m] that follows the `shift` (3,) [m] of an object along
+    the `table`.
 
-    It is at most `reach` [m] long. Without a table, the whole shift is followed. All is in the
-    frame of the planned hand.
+    It is the part of the shift along the table, shortened to at most `reach` [m]. With `table` None
+    it is not projected on the table. All vectors are in the frame of the planned hand.
     """
     if table is not None:
         up = unit(table.normal)
@@ -461,10 +463,10 @@ def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> F
 def next_palm(
     palm: Float[Tensor, "3"], goal: Float[Tensor, "3"], period: float
 ) -> Float[Tensor, "3"]:
-    """Return the palm's displacement [m] one tick of `period` [s] later, on a straight line to its
-    `goal` [m].
+    """Return the palm's displacement (3,) [m] a time of `period` [s] later, on a straight line to
+    its `goal` (3,) [m].
 
-    The palm moves at `PALM_SPEED`.
+    The palm moves at 0.04 m/s (`PALM_SPEED`), and stops at the goal.
     """
     way = goal - palm
     longest = PALM_SPEED * period

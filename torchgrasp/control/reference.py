@@ -118,7 +118,7 @@ class ClosingReference(Value):
         * joints beyond their limits, or numbers in the grasp that are not finite;
         * contacts without `std_m`;
         * a `force` outside [0.01, 100] N, or a stiffness that is not positive;
-        * a friction in its metadata that may be 0;
+        * a friction in its metadata that is 0, or a distribution that includes 0;
         * a `stability` for other than three fingers.
         """
         check_single(grasp)
@@ -219,8 +219,8 @@ class ClosingReference(Value):
         of the table.
 
         This cached property is in the frame of the planned hand. It is 0 without a table, and if no
-        link is in the table. It is also 0 for a hand that would have to rise by more than 30 mm, as
-        in `ik.opened_pose`. `MOTION.most` is this height.
+        link is in the table. It is also 0 for a hand that would have to rise by more than 30 mm
+        (`MOTION.most`).
         """
         planned = torch.eye(4, dtype=torch.float64)[None]
         return opened_pose(self.hand, self.pregrasp[None], planned, self.table)[0, :3, 3]
@@ -277,18 +277,20 @@ def next_target(
     period: float,
     fastest: float = math.inf,
 ) -> Float[Tensor, " h"]:
-    """Return the targets [rad] of the actuated joints one tick later, within the joint limits.
+    """Return the targets [rad] of the h actuated joints after another control period, within the
+    joint limits.
 
     No target moves faster than `fastest`: all joints slow down together, so that the fingertips
     keep their directions.
 
     Args:
         reference: the closing plan.
-        target: the present targets [rad].
-        velocity: commanded velocity [m/s] of each fingertip.
+        target: the present targets [rad] of the h actuated joints.
+        velocity: commanded velocity [m/s] of each of f fingertips, in the frame of the planned
+            hand's root link.
         observation: the present observation.
         lead: largest difference [rad] between a target and the measured joint.
-        period: time [s] to the next tick.
+        period: control period [s]: time to the next targets.
         fastest: largest speed [rad/s] of a target.
     """
     jacobian = observation.jacobian @ reference.hand.actuated.coupling

@@ -32,15 +32,15 @@ class RegraspNumbers:
     """Parameters by which another grasp is chosen after a failed one."""
 
     gap: float = 0.015
-    """Mean distance [m] of the contacts above which a grasp differs."""
+    """Mean distance [m] between the contacts of two grasps above which they count as different."""
     turn: float = math.radians(30)
-    """Angle [rad] of the approaches above which a grasp differs."""
+    """Angle [rad] between the approaches of two grasps above which they count as different."""
     share: float = 0.35
     """Share of the object's mass that may be concentrated at one surface point."""
     withdrawal: float = 0.6
     """Time [s] in which the opened hand withdraws, and the object rests."""
     places: int = 64
-    """Least number of surface points that are tried as the place of this mass; fewer if the surface
+    """Least number of surface points at which this mass is assumed in turn; fewer if the surface
     has fewer.
     """
 
@@ -52,12 +52,13 @@ REGRASP = RegraspNumbers()
 def next_grasp(
     grasps: Grasps, tried: Sequence[int], surface: SignedDistanceField | None = None
 ) -> int:
-    """Return the index of the grasp of `list_others` that most likely holds, after those `tried`
-    failed.
+    """Return the index in `grasps` of the grasp that most likely holds, after those with indices
+    `tried` failed.
 
-    `surface` is the estimated surface of the object, in the frame of the grasps. Without it or a
-    table, or if the grasps are not ranked by success, it is the best-ranked one. Raises
-    `BadArgument` if no other grasp is left.
+    Only grasps that differ clearly from the tried ones count (`list_others`). `surface` is the
+    estimated surface of the object, in the frame of the grasps. The first of the other grasps is
+    returned in three cases: `surface` is None, the grasps have no table, or they are not ranked by
+    success. Raises `BadArgument` if no other grasp is left.
     """
     others = list_others(grasps, tried)
     if not len(others):
@@ -69,7 +70,7 @@ def next_grasp(
 
 @checked
 def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
-    """Return the indices (k,) of the grasps that differ from each grasp with an index in `tried`.
+    """Return the indices (k,) of the k grasps that differ from each grasp with an index in `tried`.
 
     Two grasps differ if their approaches are more than 30 degrees apart (`REGRASP.turn`). They also
     differ if the mean distance of their contacts is more than 15 mm (`REGRASP.gap`).
@@ -195,7 +196,7 @@ class GraspTry:
 
         Args:
             observation: what the hand measures at the end of the tick (`observe`).
-            height: height [m] of the hand above its place at the start of the lift.
+            height: height [m] of the hand above its position at the start of the lift.
             period: length [s] of the tick, 1e-5 to 1.
 
         Raises `BadArgument` for a period out of range, or a height outside [-1, 10] m.

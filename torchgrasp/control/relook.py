@@ -25,7 +25,7 @@ class RelookNumbers:
     points: int = 300
     """Most points of the cloud that are used."""
     shifts: int = 17
-    """Number of shifts of the grid on each axis of the table, from -`REACH` to `REACH`."""
+    """Number of shifts of the grid on each axis of the table, from -80 mm to 80 mm (`REACH`)."""
     turns: int = 7
     """Number of rotations of the grid."""
     farthest: float = 0.52
@@ -45,13 +45,13 @@ RELOOK = RelookNumbers()
 
 @checked
 def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> Float[Tensor, "4 4"]:
-    """Return the motion of an object along its table since its surface was estimated.
+    """Return the motion (4, 4) of an object along its table since its surface was estimated.
 
-    It is a rigid transform [m] of old to new points in the frame of the arguments. It is a shift
-    along the table and a rotation about its normal. The motion minimises the sum of log(1 + (d_i /
-    s)^2). Here d_i are the signed distances of the new points from the moved surface, and s = 4 mm.
-    This is Cauchy's cost, which outliers hardly change. A grid search to 80 mm and 30 degrees
-    starts Gauss-Newton steps.
+    It is a rigid transform [m] of old to new points, in the frame that all arguments share. It is a
+    shift along the table and a rotation about its normal. The motion minimises the sum of log(1 +
+    (d_i / s)^2). Here d_i are the signed distances of the new points from the moved surface, and s
+    = 4 mm. This is Cauchy's cost, which outliers hardly change. A grid search to 80 mm and 30
+    degrees starts Gauss-Newton steps.
 
     Args:
         surface: the estimated surface (`surface_field`).

@@ -136,8 +136,10 @@ class DriveFeel:
     """Estimator of contact forces from the joint drives alone: a call returns the low-passed normal
     force (f,) [N] of each fingertip.
 
-    A blocked joint does not reach its target. A drive of stiffness k and damping d exerts the
-    torque k (target - q) - d dq/dt. Here q is the joint angle.
+    The call takes an `Observation`, the targets (j,) [rad] of all joints, and the period [s] of
+    control. A blocked joint does not reach its target. A drive of stiffness k and damping d exerts
+    the torque k (target - q) - d dq/dt. Here q is the joint angle. f counts fingertips, and j all
+    joints of the URDF.
     """
 
     def __init__(self, reference: ClosingReference) -> None:

@@ -31,20 +31,22 @@ Filtered = TypeVar("Filtered", Tensor, np.ndarray, float)
 
 @dataclasses.dataclass(frozen=True)
 class TactileNumbers:
-    """Parameters of simulated fingertip sensors; the noise of their normal force is `NOISE` [N]."""
+    """Parameters of simulated fingertip sensors. The standard deviation of their normal force is
+    0.1 N (`NOISE`).
+    """
 
     cutoff: float = 20.0
     """Cut-off frequency [Hz] of the low-pass filter that models the lag of the sensor."""
     tangential: float = 0.3
-    """Standard deviation [N] of the force along the surface."""
+    """Standard deviation [N] of the sensed force along the surface."""
     place: float = 1.5e-3
     """Standard deviation [m] of the sensed position of the contact, on each axis along the
     surface.
     """
     slide: float = 2e-3
-    """Standard deviation [m/s] of the sliding speed."""
+    """Standard deviation [m/s] of the sensed sliding speed."""
     radius: float = 0.012
-    """Radius [m] that is assumed of tips that are not round."""
+    """Radius [m] that is assumed for fingertips that are not round."""
 
 
 TACTILE = TactileNumbers()
@@ -116,7 +118,7 @@ def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -
     state of a closing.
 
     Forces are 0, contact points and normals NaN, in float64 on the CPU. The fingertips are sampled
-    at the next control tick.
+    at the next control tick, a period of the controller.
 
     Args:
         batch: sizes of further leading axes of all tensors; by default none.
@@ -212,10 +214,11 @@ def measure(
 def flag(
     before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: Float[Tensor, "f"] | float
 ) -> Tensor:
-    """Return a mask (*b, f) of the fingertips that touch, with hysteresis.
+    """Return a mask (*b, f) of the f fingertips that touch, with hysteresis. `*b` stands for any
+    leading axes.
 
     A fingertip that touched `before` touches while its low-passed normal force `average` [N] is
-    above `TOUCH_ON` / 2 times `factor`. Another fingertip touches above `TOUCH_ON` times `factor`.
+    above 0.1 N times `factor`. Another fingertip touches above 0.2 N (`TOUCH_ON`) times `factor`.
     The `factor` (no unit) is greater for noisier sensors.
     """
     return torch.where(before, average > 0.5 * TOUCH_ON * factor, average > TOUCH_ON * factor)
@@ -230,10 +233,10 @@ def low_pass(cutoff: float, period: float) -> float:
 
 
 def smooth(old: Filtered, new: Filtered, cutoff: float, period: float) -> Filtered:
-    """Return a low-passed value one tick later, from its `old` value and a `new` measurement of the
-    same unit.
+    """Return the output of a low-pass filter: its `old` value, moved towards a `new` measurement of
+    the same unit.
 
-    The filter has a `cutoff` [Hz] and a `period` [s].
+    The filter is of first order, with a `cutoff` [Hz] and a `period` [s] between measurements.
     """
     return old + low_pass(cutoff, period) * (new - old)
 
@@ -308,10 +311,11 @@ def joint_jacobian(
     """Return the Jacobian [m/rad] of points on the fingertips with respect to all joints of the
     URDF.
 
-    The joints count as if none were coupled. `points` [m] are points on the fingertips.
+    The joints count as if none were coupled. `points` [m] are one point on each of the f
+    fingertips.
 
-    `joints` [rad] are the positions of all joints, and the points are in the frame of the root
-    link.
+    `joints` [rad] are the positions of all j joints. Points and Jacobian are in the frame of the
+    hand's root link.
     """
     axes, origins = hand.tree.joint_axes(hand.tree.poses(joints[None])[0])
     arms = points[:, None] - origins  # (f, j, 3)

@@ -40,18 +40,21 @@ class ClosingNumbers:
     """Reading [N] of a tactile fingertip that counts as a touch before the contact flag turns on.
     """
     lead: float = 0.04
-    """Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link
-    that is blocked.
+    """Largest difference [rad] between the joint targets and joints of a waiting finger. It bounds
+    the force of a link that is blocked.
     """
     growth: float = 0.25
-    """Time [s] of waiting for the other fingers in which this lead grows by its first value."""
+    """Time [s] of waiting for the other fingers in which `lead` grows by its first value."""
     follows: float = 6.0
     """Gain [1/s] with which the palm follows the object."""
     # of a finger without a sensor
     stalled: float = 0.25
-    """Force [N] felt by its drives at which a finger without a sensor counts as touching."""
+    """Force [N], estimated from its drives, at which a finger without a sensor counts as touching.
+    """
     deviations: float = 3.0
-    """Standard deviations beyond its contact at which such a finger counts as touching."""
+    """Distance beyond its contact, in standard deviations, at which a finger without a sensor
+    counts as touching.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,13 +64,16 @@ class RimNumbers:
     slope: float = 0.25
     """Least component of the contact's unit normal along the table's normal."""
     near: float = 0.004
-    """Height [m] of a tip below which it is at the table."""
+    """Height [m] of a fingertip over the table below which it counts as at the table."""
     rate: float = 12.0
-    """Rate [1/s] at which a tip goes down to its height."""
+    """Rate [1/s] at which the distance of a fingertip from its sliding height decreases."""
     gap: float = 0.0003
-    """Height [m] of a sliding tip: the lower a tip, the flatter its contact's normal."""
+    """Height [m] over the table of a sliding fingertip: the lower it is, the flatter its contact's
+    normal.
+    """
     fastest: float = 0.8
-    """Largest speed [rad/s] of joints: faster ones lag, and tips leave the table."""
+    """Largest speed [rad/s] of the joints: faster joints lag, and the fingertips leave the table.
+    """
 
 
 CLOSING = ClosingNumbers()
@@ -128,8 +134,9 @@ class UncertaintyClosing:
     ) -> "UncertaintyClosing":
         """Return this controller, with another initial palm and expected object.
 
-        `palm` [m] is the palm's displacement from its planned pose, and `displacement` the expected
-        translation [m] and rotation vector [rad] of the object.
+        `palm` [m] is the palm's displacement from its planned pose. `displacement` is the expected
+        displacement of the object since the plan: the translation [m] of the contacts' centroid,
+        then a rotation vector [rad]. Both are in the frame of the planned hand.
         """
         self.planes = ContactPlanes(self.reference, displacement)
         self.palm = palm
@@ -293,11 +300,11 @@ class UncertaintyClosing:
 
 
 def rim_contacts(reference: ClosingReference) -> Bool[Tensor, "f"]:
-    """Return a mask (f,) of the contacts on the upper rim of a low object.
+    """Return a mask (f,) of the planned contacts on the upper rim of a low object.
 
-    Their normals are inclined upwards (`RIM.slope`), and the fingertips that touch them are lower
-    than `RIM.near` over the table. Fingertips farther beyond the table's edge than above its plane
-    do not count. Without a table there are none.
+    Their unit normals have a component above 0.25 along the table's normal (`RIM.slope`). The
+    fingertips that touch them are lower than 4 mm over the table (`RIM.near`). Fingertips farther
+    beyond the table's edge than above its plane do not count. Without a table there are none.
     """
     table = reference.table
     if table is None:
@@ -318,19 +325,21 @@ def slide_along(
 ) -> Float[Tensor, "f 3"]:
     """Return the fingertips' `velocity` [m/s], changed so that the `low` ones stay at the table.
 
-    Their velocity along the table's unit normal `up` becomes `RIM.rate` (`RIM.gap` - h). This
-    brings them to the height `RIM.gap` and keeps them there. Here h is `height` [m], that of each
-    fingertip's lowest point over the table. `low` is a mask of the fingertips that slide.
+    Their velocity along the table's unit normal `up` becomes r (g - h). Here r is 12 / s
+    (`RIM.rate`), and g is 0.3 mm (`RIM.gap`). This brings them to the height g and keeps them
+    there. h is `height` [m], that of each fingertip's lowest point over the table. `low` is a mask
+    of the fingertips that slide. Velocities and `up` are in one frame. f counts fingertips.
     """
     down = RIM.rate * (RIM.gap - height) - velocity @ up
     return velocity + (down * low)[:, None] * up
 
 
 def with_equal_gains(reference: ClosingReference) -> ClosingReference:
-    """Return the plan with gains that ignore the uncertainty, for the closing "fixed".
+    """Return the gains of the plan `reference`, changed so that they ignore the uncertainty: those
+    of the closing mode "fixed".
 
-    All contacts have the covariance `POSITION_FLOOR`^2 I [m^2] and the position gain
-    `POSITION_RATE` [1/s]. Each finger has its largest force gain on all axes.
+    All contacts have the covariance (5 mm)^2 I (`POSITION_FLOOR`) and the position gain 4 / s
+    (`POSITION_RATE`). Each finger has its largest force gain on all axes.
     """
     gains = reference.gains
     eye = torch.eye(3, dtype=gains.covariance.dtype).expand_as(gains.covariance)

@@ -65,7 +65,8 @@ def _named(read: Callable[[Any], Read]) -> Callable[[Any, str], Read]:
 
 @_named
 def as_cloud(value: Any) -> PointCloud:
-    """Return a `PointCloud` [m], in its own frame, given any value that `CloudLike` names.
+    """Return a `PointCloud` [m], given any value that the library takes for a cloud (`CloudLike`).
+    Its frame is that of the value.
 
     The value may be a cloud, a `GraspObject`, a file, or an array or tensor (n, 3) [m]. It may also
     be a cloud of Open3D or trimesh. The name of a shipped object means its view. An array has no
@@ -109,8 +110,8 @@ def as_scene(value: Any) -> Scene:
 
 @_named
 def as_seen(value: Any) -> PointCloud | Scene:
-    """Return a `Scene`, given a scene or the path of one; else the `PointCloud` that `as_cloud`
-    makes of the value.
+    """Return a `Scene`, given a scene or the path of a file of `save_scene`; else the `PointCloud`
+    that `as_cloud` makes of the value.
 
     Raises `BadArgument` for anything else.
     """
@@ -122,8 +123,8 @@ def as_seen(value: Any) -> PointCloud | Scene:
 def as_hand(value: Any) -> Hand:
     """Return a `Hand`, given a hand, the name of a shipped hand, or the folder of another hand.
 
-    A shipped hand is loaded once, so that what the planner derives from it is kept. Raises
-    `BadArgument` for anything else.
+    A shipped hand is loaded only once, so that what the planner computes from it is kept for later
+    calls. Raises `BadArgument` for anything else.
     """
     if isinstance(value, Hand):
         return value

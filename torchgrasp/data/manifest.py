@@ -44,30 +44,34 @@ SHOWN_NAMES = 100  # most names that an error message quotes
 
 @dataclasses.dataclass(frozen=True)
 class CameraNumbers:
-    """Bounds on where the cameras of `write_objects` are."""
+    """Bounds on the camera positions of `write_objects`."""
 
     lowest: float = 25.0
-    """Least angle [deg] above the horizontal."""
+    """Least elevation [deg] of a camera above the horizontal, seen from the object."""
     highest: float = 45.0
-    """Greatest angle [deg] above the horizontal."""
+    """Greatest elevation [deg] of a camera above the horizontal, seen from the object."""
     distance: float = 0.5
-    """Distance [m] from the object."""
+    """Distance [m] of a camera from the object."""
     seeds: int = 2**31
     """Number of random seeds among which the seed of a view's noise is drawn."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StandNumbers:
-    """Bounds by which a mesh cannot stand as it lies."""
+    """Bounds beyond which a mesh cannot stand on its lowest points as it is oriented in its file.
+    Its foot is the set of its lowest vertices.
+    """
 
     foot: float = 0.001
-    """Greatest height [m] of the vertices of its foot over the lowest one."""
+    """Greatest height [m] of the vertices of the foot over the lowest one."""
     beside: float = 0.002
-    """Least distance [m] of its mass centre from its foot, seen from above."""
+    """Least horizontal distance [m] of the centre of mass from the foot at which the mesh falls
+    over.
+    """
     rocks: float = 0.1
-    """Greatest angle [rad] by which a mesh may turn until it stands, as scans that rock do."""
+    """Greatest angle [rad] by which a mesh may turn until it stands: scans may rock a little."""
     directions: int = 360
-    """Directions in which the mass centre may be beside the foot."""
+    """Number of horizontal directions in which the centre of mass is compared with the foot."""
 
 
 CAMERAS = CameraNumbers()
@@ -85,9 +89,9 @@ class ObjectEntry:
     mass: float | None  # mass [kg] of the real object at any scale, or None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
-        """Return at most `most` names of views, sorted; by default all.
+        """Return at most `most` names of the object's views, sorted; None means all.
 
-        With `whole`, the only name is `WHOLE`, that of the view that shows all sides.
+        With `whole`, the only name is "whole" (`WHOLE`), that of the view that shows all sides.
         """
         return ([WHOLE] if whole else sorted(self.views))[:most]
 
@@ -96,7 +100,7 @@ class ObjectEntry:
 def read_entry(objects: Path | str, name: str) -> ObjectEntry:
     """Return the description of an object from the manifest of a folder of objects.
 
-    Raises `DatasetError` for a bad or missing one.
+    Raises `DatasetError` for a bad or missing manifest, or a bad or missing entry of the object.
     """
     return _parse_entry(name, _read_fields(objects, [name])[name])
 
@@ -105,9 +109,11 @@ def read_entry(objects: Path | str, name: str) -> ObjectEntry:
 def read_entries(
     objects: Path | str, only: Sequence[str] = ()
 ) -> dict[str, ObjectEntry | DatasetError]:
-    """Return the description of each object, or the error of a bad one, sorted by name.
+    """Return the description of each object in a folder of objects, sorted by name. For a bad entry
+    it is the error.
 
-    `only` names the objects, by default all. Raises `DatasetError` for a bad manifest.
+    `only` are the names of the objects; empty means all. Raises `DatasetError` for a bad manifest,
+    or one that lacks an object of `only`.
     """
     found: dict[str, ObjectEntry | DatasetError] = {}
     for name, field in sorted(_read_fields(objects, only).items()):

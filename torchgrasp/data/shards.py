@@ -101,7 +101,7 @@ class Shard(NamedTuple):
     records: Records
 
     def take(self, i: int) -> "Shard":
-        """Return a shard that holds only the job with the index `i`."""
+        """Return a shard that holds only the job with the index `i` in `rows`."""
         row = self.rows[i]
         before = self.rows[:i]
         p = sum(x.points for x in before)
@@ -114,7 +114,9 @@ class Shard(NamedTuple):
 
 
 def shard_ranges(jobs: int, size: int) -> list[range]:
-    """Return for each shard the indices of its jobs: `size` jobs, and the rest in the last shard."""
+    """Return the indices of the jobs in each shard, a file of a data set. Each has `size` of the
+    `jobs` jobs, and the last one the rest.
+    """
     return [range(first, min(first + size, jobs)) for first in range(0, jobs, size)]
 
 
@@ -125,9 +127,9 @@ def join_shards(parts: Sequence[Shard]) -> Shard:
 
 
 def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
-    """Return the bytes of the file of a shard.
+    """Return a shard as the bytes of a safetensors file.
 
-    `meta` becomes metadata of the file that identify the campaign.
+    `meta` is written to the file's metadata; it identifies the campaign.
     """
     jobs = json.dumps([row.as_json() for row in shard.rows])
     return pack_tensors(KIND, named_tensors(shard.records), {**meta, "jobs": jobs})
@@ -160,7 +162,7 @@ def load_shard(path: Path, meta: dict[str, str]) -> Shard:
 def read_row(field: Field, bare: bool = False) -> JobRow:
     """Return the outcome of a job, read from JSON; without metadata if `bare`.
 
-    Raises the error of the field for wrong content.
+    Raises the error of `field`, such as `ModelFileError`, for wrong content.
     """
     fields = field.entries(*JobRow._fields[: -1 if bare else None])  # the metadata comes last
     texts = {name: fields[name].text() for name in ("object", "view", "note", "family", "group")}
@@ -177,7 +179,7 @@ def read_row(field: Field, bare: bool = False) -> JobRow:
 
 
 def short(text: str) -> str:
-    """Return a text on one line, cut to the largest length that `read_row` accepts."""
+    """Return a text on one line. It is shortened to the largest length that `read_row` accepts."""
     line = one_line(text)
     return line if len(line) <= JSON_LETTERS else f"{line[: JSON_LETTERS - 3]}..."
 
@@ -202,7 +204,9 @@ def load_grasps(path: Path | str) -> Grasps:
 
 
 def check_grasps(path: Path | str, grasps: Grasps) -> None:
-    """Raise `ModelFileError` if grasps from a file cannot have been written by `Grasps.save`."""
+    """Raise `ModelFileError` if grasps from the file `path` hold an invalid pose, status or number
+    of contacts. `Grasps.save` cannot have written such a file.
+    """
     f = grasps.contacts.fingertips
     known = torch.tensor([int(status) for status in Status], device="cpu")
     fingers = torch.arange(f, device="cpu")

@@ -65,8 +65,8 @@ def find_view(path: Path, name: str = "cloud") -> Path:
     """Return the path of a cloud, which may be given as the name of a shipped object.
 
     The name gives the path of the object's noisy view; any other path is returned itself. Raises
-    `BadArgument` for a word that is neither a file nor a shipped object; errors call the argument
-    `name`.
+    `BadArgument` for a word that is neither a file nor a shipped object. `name` is the name of the
+    argument in this error.
 
     >>> find_view(Path("jug")).name, find_view(Path("mine.ply")).name
     ('view.ply', 'mine.ply')
@@ -102,10 +102,11 @@ def load_object(name: str) -> GraspObject:
 def solid_of(
     given: "trimesh.Trimesh | Path | str | GraspObject", parts: "Sequence[trimesh.Trimesh] | None"
 ) -> "tuple[trimesh.Trimesh, Sequence[trimesh.Trimesh] | None]":
-    """Return the closed mesh [m] of a given object, and its convex parts.
+    """Return the closed mesh [m] of an object, and its convex parts [m].
 
-    They are `parts`. If those are None, they are the parts of a `GraspObject`, or else unknown
-    (None). Raises `MeshError` for a mesh that is missing, open or without volume.
+    The convex parts are `parts`. If `parts` is None, they are those of the `GraspObject`; for
+    another mesh they are None, unknown. Raises `MeshError` for a mesh that is missing, open or
+    without volume.
     """
     if isinstance(given, GraspObject):
         return read_mesh(given.mesh), given.parts if parts is None else parts
@@ -144,7 +145,7 @@ def load_scene() -> Scene:
     """Return a scene of the four shipped objects on a table: a rendered, noisy depth image with
     true labels.
 
-    Its frame has z up, in metres.
+    The scene is in metres, with z up.
 
     >>> load_scene().things
     (1, 2, 3, 4)

@@ -26,9 +26,10 @@ def import_arrow() -> Any:
 
 
 def as_column(rows: Tensor) -> Any:
-    """Return a tensor as a column of Arrow with one entry for each index of the first axis.
+    """Return a tensor as a column of pyarrow, with one entry for each index of the tensor's first
+    axis.
 
-    An entry is a number, or fixed lists of numbers if there are more axes.
+    An entry is a number. If there are more axes, it is a nested list of numbers of fixed length.
     """
     arrow = import_arrow()
     column = arrow.array(rows.cpu().reshape(-1).numpy())
@@ -38,16 +39,17 @@ def as_column(rows: Tensor) -> Any:
 
 
 def as_table(columns: Mapping[str, Any], meta: Mapping[str, str]) -> Any:
-    """Return a table of Arrow, given its columns by name.
+    """Return a table of pyarrow, given its columns by name.
 
-    Tensors become columns by `as_column`; `meta` becomes the metadata of the schema.
+    Tensors become columns with an entry for each index of the first axis (`as_column`). `meta`
+    becomes the metadata of the table's schema.
     """
     cells = {name: as_column(x) if isinstance(x, Tensor) else x for name, x in columns.items()}
     return import_arrow().table(cells).replace_schema_metadata(dict(meta))
 
 
 def pack_table(table: Any) -> bytes:
-    """Return the bytes of the Parquet file of a table of Arrow."""
+    """Return a table of pyarrow as the bytes of a Parquet file."""
     buffer = io.BytesIO()
     # Without dictionaries: hardly any number comes twice.
     import_arrow().parquet.write_table(table, buffer, compression="zstd", use_dictionary=False)
@@ -55,7 +57,7 @@ def pack_table(table: Any) -> bytes:
 
 
 def render_card(template: str, **values: Any) -> str:
-    """Return the text of a card, for people or programs, made from a template and values by name.
+    """Return the text of a card, the description of a data set, from a template and values by name.
 
     `template` is a file name in the folder of templates, without ".jinja".
     """
@@ -67,10 +69,11 @@ def render_card(template: str, **values: Any) -> str:
 def write_folder(
     folder: Path | str, source: Mapping[str, Any], files: Iterable[tuple[str, str | bytes]]
 ) -> Path:
-    """Write files by name, one by one; return the folder.
+    """Write files of given names into a folder, one by one; return the folder.
 
-    `files` are pairs of name and content. `source.json` holds `source`, of which the files are
-    made. Raises `OutputError` if the folder holds other files or cannot be written.
+    `files` are pairs of name and content. The file `source.json` gets the content of `source`,
+    which says what the files are made from. Raises `OutputError` if the folder holds other files or
+    cannot be written.
     """
     folder = Path(folder)
     with hold_folder(folder):

@@ -36,9 +36,9 @@ RAISED = 1e-3  # greatest height [m] by which a raised hand is below the height 
 def find_cause(tries: Sequence[LiftTry], trial: GraspTrial, spec: TrialSpec) -> tuple[str, float]:
     """Return (cause, size): why the object was not held in the last try of a trial.
 
-    The cause is a name in `CAUSES`, where the unit of the size is found. They are "" and NaN if the
-    object was held, or the simulation did not stay finite. `tries` are the results of the trial's
-    lifts, and `trial` and `spec` its input.
+    The cause is a key of the dict `CAUSES`, which also holds the unit of the size. `ProtocolResult`
+    explains all causes. The result is ("", NaN) if the object was held, or the simulation did not
+    stay finite. `tries` are the results of the trial's lifts, and `trial` and `spec` its input.
     """
     truth = trial.truth
     *before, (row, lift) = tries
@@ -94,7 +94,7 @@ def _sizes(
 
 
 def tick_of(lift: ClosureResult, phase: int) -> int:
-    """Return the index of the tick at which a phase of a lift ended.
+    """Return the index of the control tick in the record `lift` at which a phase of the lift ended.
 
     The `phase` is 0 (approach), 1 (closing) or 2 (pressing). A phase whose end in
     `ClosureResult.phases` is NaN gives the last tick.

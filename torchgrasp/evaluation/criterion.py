@@ -24,11 +24,11 @@ SLIP_ANGLE = math.radians(30)
 
 @dataclasses.dataclass(frozen=True)
 class Tick(Value):
-    """The state of the simulation at one control tick; with a leading axis t, the states at all
-    ticks.
+    """The state of the simulation at one control tick, a period of the controller. With a leading
+    axis t, it holds the states at all ticks.
 
-    Poses and points are in the simulator's frame, whose z axis points up. The j joints are in the
-    scene's order.
+    Poses and points are in the simulator's frame, whose z axis points up. j counts all joints of
+    the URDF, in the order of the simulated scene. m counts neighbours: other bodies on the table.
     """
 
     time: Float[Tensor, "*t"]  # since the start [s]
@@ -53,9 +53,9 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
         judged: number of last ticks in which the fingers must touch the object.
         lift_height: height of the lift [m].
 
-    The object is held if three conditions are met. Its centre rose by half of the lift. Two fingers
-    touch it in most of the judged ticks. Since it was pressed it slipped less than `SLIP_DISTANCE`
-    and `SLIP_ANGLE`.
+    The object is held if three conditions are met. Its centre rose by at least half of the lift. At
+    least two fingers touch it in most of the judged ticks. Since the pressing ended, it slipped in
+    the hand by less than 20 mm and 30 degrees (`SLIP_DISTANCE`, `SLIP_ANGLE`).
     """
     half = 0.5 * lift_height
     rise = [float(tick.centre[2] - ticks[0].centre[2]) for tick in ticks]
@@ -68,7 +68,8 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
 
 
 def motion_between(first: Tick, last: Tick, in_hand: bool = True) -> ObjectMotion:
-    """Return the motion [m] of the object's centre and its rotation [rad] from one tick to another.
+    """Return the motion [m] of the object's centre and its rotation [rad] from the control tick
+    `first` to `last`.
 
     They are relative to the hand, or to the world if not `in_hand`.
     """

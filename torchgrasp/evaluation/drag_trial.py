@@ -47,11 +47,15 @@ class DragTrialNumbers:
     rest: float = 0.5
     """Time [s] after the drag in which the object comes to rest."""
     below: float = 0.005
-    """Depth [m] of the object's lowest point below the table from which it falls over the edge."""
+    """Depth [m] of the object's lowest point below the table, beyond which it hangs or falls over
+    the edge.
+    """
     tipped: float = math.radians(10)
-    """Turn [rad] of the object's vertical from which it has toppled."""
+    """Tilt [rad] of the object against the vertical beyond which it has toppled."""
     slipped: float = 0.02
-    """Distance [m] from the planned place beyond which the tips slid over the object."""
+    """Distance [m] of the object from its planned position, beyond which the fingertips slid over
+    it.
+    """
     table_friction: float = 0.3
     """Coefficient of friction between object and table by default: that of `plan_edge_grasps`."""
 
@@ -68,11 +72,12 @@ class DragResult(Value):
         status: `OK`, or the reason of a failure.
             `NO_CONTACT`: the hand could not press, or lost the object on the way.
             `DROPPED`: the object toppled, or hangs or fell over the edge.
-            `SLIPPED`: the object is more than 20 mm (`DRAGS.slipped`) from its planned place.
-            `START_OVERLAP` and `UNSTABLE`: as in `close_hand`.
+            `SLIPPED`: the object is more than 20 mm (`DRAGS.slipped`) from its planned position.
+            `START_OVERLAP`: the hand overlapped the object or the table at the start.
+            `UNSTABLE`: the simulation diverged.
         motion: motion (4, 4) [m] of the object from the start of the trial to its end. It is a
             rigid transform in the frame of the planned cloud. NaN if the status is `UNSTABLE`.
-        missed: distance [m] of the object's centre of mass from its planned place. NaN if the
+        missed: distance [m] of the object's centre of mass from its planned position. NaN if the
             status is `UNSTABLE`.
         forces: sum (t,) [N] of the true normal forces of the fingertips at each control tick.
     """
@@ -96,7 +101,7 @@ def drag_object(
     table: Plane | None = None,
 ) -> DragResult:
     """Drag the true object as planned, in simulation; return where it came to rest, and whether
-    this is its planned place.
+    this is its planned position.
 
     Args:
         plan: the drag, from `plan_edge_grasps`.

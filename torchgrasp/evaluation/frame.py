@@ -19,9 +19,9 @@ DECIMALS = 9  # decimals to which the offset [m] of a table is rounded
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
     """Return the pose [m] of the simulator's frame in the frame of the grasp.
 
-    The table is at z = 0, the hand above the origin. The x axis is along the hand's x axis. If that
-    is steeper than 60 degrees, it is along the hand's y axis. `obj_from_hand` is the hand's pose
-    [m] in the frame of the grasp.
+    The table is at z = 0 and its normal along z; the hand's root link is above the origin. The x
+    axis is along the hand's x axis. If that is steeper than 60 degrees, it is along the hand's y
+    axis. `obj_from_hand` is the hand's pose [m] in the frame of the grasp.
     """
     z = unit(table.normal.double())
     origin = obj_from_hand[:3, 3]
@@ -32,11 +32,11 @@ def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tens
 
 
 def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
-    """Return a grasp in the coordinates of another frame.
+    """Return a grasp with its contacts, hand pose and approach in the coordinates of another frame.
 
-    `obj_from_frame` [m] is the pose of that frame in the grasp's present frame. Contacts, hand pose
-    and approach are converted; other fields, such as the certificate, are not. Contact points are
-    rounded to multiples of `GRID` [m], all other converted numbers to multiples of `FINE`.
+    `obj_from_frame` [m] is the pose of that frame in the grasp's present frame. Other fields, such
+    as the certificate, are not converted. Contact points are rounded to multiples of about 1 um
+    (`GRID`). All other converted numbers are rounded to multiples of about 1e-9 (`FINE`).
     """
     frame_from_obj = inverse(obj_from_frame)
 
@@ -54,20 +54,25 @@ def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
 
 
 def rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Return numbers of about size 1, rounded to multiples of the small step `FINE`."""
+    """Return numbers, rounded to multiples of a step of about 1e-9 (`FINE`). Their size should be
+    about 1.
+    """
     return torch.round(numbers / FINE) * FINE
 
 
 def rounded_table(table: Plane) -> Plane:
-    """Return a table whose numbers, and those of its edge, are rounded."""
+    """Return a table with rounded numbers, also those of its edge: to about 1e-9, offsets in
+    metres.
+    """
     edge = None if table.edge is None else rounded_table(table.edge)
     return Plane(rounded(table.normal), round(table.offset, DECIMALS), edge)
 
 
 def moved_mesh(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "trimesh.Trimesh":
-    """Return a mesh [m], converted to the simulator's frame with the pose `obj_from_world` [m].
+    """Return a mesh [m] of the grasp's frame in the coordinates of the simulator's frame.
+    `obj_from_world` (4, 4) [m] is the pose of the simulator's frame in the grasp's frame.
 
-    Its vertices are rounded to multiples of `GRID` [m].
+    The vertices are rounded to multiples of about 1 um (`GRID`).
     """
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     moved = to_upright(vertices, obj_from_world).numpy()

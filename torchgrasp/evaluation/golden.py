@@ -45,7 +45,7 @@ GOLDEN = (
 
 
 class GoldenResult(NamedTuple):
-    """The outcome of a test case."""
+    """The outcome of a test case of the simulation."""
 
     case: GoldenCase
     held: bool  # whether the simulated hand held the object
@@ -59,7 +59,7 @@ class GoldenResult(NamedTuple):
 
 @checked
 def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
-    """Simulate each test case of `GOLDEN` in a `simulator`, and yield its result."""
+    """Simulate each test case of the tuple `GOLDEN` in a `simulator`, and yield its result."""
     for case in GOLDEN:
         thing = load_object(case.object)
         hand = load_hand(case.hand)

@@ -24,7 +24,7 @@ class BootstrapNumbers:
     resamples: int = 10_000
     """Resamples of the families; with more, the ends of the interval vary less."""
     outside: float = 0.05
-    """Probability that the value lies outside the interval."""
+    """Probability that the true value lies outside the interval."""
     tails: tuple[float, float] = (0.025, 0.975)
     """Quantiles at the ends of the interval."""
 
@@ -59,7 +59,8 @@ class Share(NamedTuple):
 
 @checked
 def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
-    """Return (passed, all), the numbers of trials of each unit, by its name.
+    """Return (passed, all) for each unit, such as a family of objects, by its name. They are the
+    numbers of trials that passed, and of all trials.
 
     `outcomes` are pairs of a unit's name and whether one trial passed.
     """
@@ -73,10 +74,11 @@ def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]
 @checked
 def share_over(counts: Counts, seed: Seed = 0) -> Share:
     """Return the success rate over all trials, with its 95 % interval from resampling the units.
+    `counts` holds (passed, all), the numbers of trials of each unit, by its name.
 
     If all trials passed, or none, resampling gives no width. The interval is then the one-sided 95
-    % bound of n independent trials, n being the number of units. Its lower end is 0.05 ** (1 / n).
-    `seed` draws the resamples.
+    % bound of n independent trials, n being the number of units. Its lower end is 0.05 ** (1 / n)
+    if all passed. Its upper end is 1 minus this if none passed. `seed` draws the resamples.
     """
     found = contrast_over([counts], [1.0], seed)
     if found.units > 1 and found.value in (0.0, 1.0):
@@ -89,10 +91,11 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: Seed = 0) -> Share:
     """Return a weighted sum of success rates, with a 95 % interval.
 
-    Each of `columns` holds the counts of one rate, and `weights` its weight: 1 and -1 give a
-    difference. All rates use the same resampled units, which `seed` draws. `total` counts the
-    trials of the first column. Resamples in which a column has no trial are left out. An interval
-    of zero width means that the units agree, not that the value is exact.
+    Each of `columns` is for one rate. It holds (passed, all), the numbers of trials of each unit,
+    by its name. `weights` are the weights of the rates: 1 and -1 give a difference. All rates use
+    the same resampled units, which `seed` draws. `total` counts the trials of the first column.
+    Resamples in which a column has no trial are left out. An interval of zero width means that the
+    units agree, not that the value is exact.
     """
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
     total = sum(total for _, total in columns[0].values())

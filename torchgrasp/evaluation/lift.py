@@ -52,9 +52,11 @@ class LiftNumbers:
     shaking: float = 5.0
     """Frequency [Hz] at which the raised hand shakes."""
     judged: float = 0.2
-    """Time [s] at the end in which the fingers must touch the object."""
+    """Time [s] at the end of the trial in which the fingers must touch the object."""
     lost: float = 0.5
-    """Motion [m] of the object beyond the lift's height that ends the trial."""
+    """Distance [m] that the object moves, beyond the lift's height, at which the trial ends: it is
+    lost.
+    """
 
 
 LIFTS = LiftNumbers()
@@ -147,7 +149,7 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
 
 
 def run_lift(driver: TrialDriver) -> ClosureResult:
-    """Run the lift trial of a driver in a fresh scene, and return its record."""
+    """Run the lift trial that `driver` has checked, in a fresh scene, and return its record."""
     return RecordedLift(driver.open()).complete()
 
 
@@ -156,7 +158,7 @@ class _ObjectLost(Exception):
 
 
 class RecordedLift:
-    """One lift trial and the record of its ticks."""
+    """One lift trial, with the record of its control ticks."""
 
     def __init__(self, run: TrialRun) -> None:
         self.run = run
@@ -170,13 +172,15 @@ class RecordedLift:
         self.pressed: int | None = None
 
     def complete(self) -> ClosureResult:
-        """Run all phases of the trial; return its record."""
+        """Run all phases of the trial, from approach to hold; return its record."""
         started = time.perf_counter()
         status = self.perform()
         return self.result(status, time.perf_counter() - started)
 
     def perform(self) -> Status:
-        """Run all phases of the trial; return its status."""
+        """Run all phases of the trial, from approach to hold. Return `OK` if the object was held,
+        or why not.
+        """
         self._record()
         if not self.run.starts:
             return Status.START_OVERLAP
@@ -316,7 +320,9 @@ class RecordedLift:
         return motion_between(self.ticks[first], self.ticks[last], in_hand)
 
     def result(self, status: Status, seconds: float) -> ClosureResult:
-        """Return the record of the trial as a `ClosureResult`."""
+        """Return the record of the trial as a `ClosureResult`, with its `status` and its wall time
+        `seconds` [s].
+        """
         ticks = map_tensors(lambda *tensors: torch.stack(tensors), *self.ticks)
         robot = self.run.robot
         obj_from_world = self.run.obj_from_world

@@ -257,7 +257,7 @@ def seed_of(seed: Seed, *names: str | int) -> int:
 def draw_trial(trial: TrialSpec, seed: Seed) -> TrialSpec:
     """Return the parameters of a trial, with friction and mass drawn if they are distributions.
 
-    The draws are independent. `seed` is that of the trial.
+    The draws are independent, and depend only on `seed`, that of the trial.
     """
     friction = Distribution.of(trial.friction).sample(1, seed_of(seed, "friction"))
     mass = Distribution.of(trial.mass).sample(1, seed_of(seed, "mass"))
@@ -266,7 +266,8 @@ def draw_trial(trial: TrialSpec, seed: Seed) -> TrialSpec:
 
 @checked
 def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Return n = `count` random pose errors of the hand [m], each in the frame of the planned hand.
+    """Return n = `count` random pose errors of the hand, rigid transforms [m] in the frame of the
+    planned hand.
 
     `noise` bounds them.
     """
@@ -283,8 +284,8 @@ def draw_object_poses(
 ) -> Float[Tensor, "n 4 4"]:
     """Return n = `count` random displacements [m] of an object on its table, as rigid transforms.
 
-    They are along the table, whose normal is z, and about the vertical through `pivot` [m]; `noise`
-    bounds them.
+    They shift the object along the table, whose normal is z, and turn it about the vertical through
+    `pivot` (3,) [m]. `noise` bounds them.
     """
     pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)
@@ -308,10 +309,11 @@ def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tens
 def draw_error(
     protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: Seed
 ) -> Float[Tensor, "4 4"]:
-    """Return the random pose error of the hand [m] for one trial of a grasp, in the hand's frame.
+    """Return the random pose error (4, 4) [m] of the hand for one trial of a grasp.
 
-    In a protocol that lifts, it stands for a displacement of the object with the true `mesh` [m].
-    `seed` is that of the trial (`seed_of`).
+    The frame is that of the hand's root link at the planned pose. In a protocol that lifts, the
+    error is equivalent to a displacement of the object with the true `mesh` [m]. `seed` is that of
+    the trial (`seed_of`).
     """
     if protocol.pull is not None:
         return draw_hand_errors(protocol.noise, 1, seed)[0]
@@ -334,7 +336,7 @@ def draw_slide(noise: PoseNoise, seed: Seed) -> Float[Tensor, "3"]:
 def draw_push(
     force: Annotated[float, Range(0.0, 1000.0)], seed: Seed
 ) -> tuple[float, float, float]:
-    """Return a force (x, y, z) [N] of the size `force` [N] in a random direction of the world.
+    """Return a force (x, y, z) [N] of the size `force` [N] in a random direction.
 
     All directions are equally likely.
     """

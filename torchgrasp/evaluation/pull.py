@@ -38,7 +38,8 @@ class PullResult(Value):
         moved: largest motion [m] of the object's centre of mass in the world, over all tried pulls.
             It counts from the start of the trial. It is infinite if the simulation diverged, and 0
             if the closing did not start.
-        turned: largest rotation [rad] of the object in the world; infinite or 0 in the same cases.
+        turned: largest rotation [rad] of the object in the world; infinite or 0 in the same cases
+            as `moved`.
         force: mean normal force [N] of the fingers before the first pull; NaN if the closing did
             not start.
         seconds: CPU time [s] of the trial.
@@ -95,9 +96,10 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
-    """Run the pull trial of a driver: grasp the object once, and pull it until one pull fails.
+    """Run the pull trial that `driver` has checked: grasp the object once, and pull it until one
+    pull fails.
 
-    `spec` says how to pull in each direction, and which motion passes.
+    `spec` gives the force and time of each pull, and the motion of the object at which it fails.
     """
     started = time.process_time()
     run = driver.open()

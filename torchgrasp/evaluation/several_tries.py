@@ -39,7 +39,8 @@ class LiftTry(NamedTuple):
     """One try of `lift_grasps`: a grasp and the record of its lift.
 
     Attributes:
-        row: index of the grasp in `trial.grasp`, the grasps in the order of preference.
+        row: index of the grasp among the grasps of the trial (`GraspTrial.grasp`), which are in the
+            order of preference.
         result: record of the lift, as `close_hand` returns it.
     """
 
@@ -88,10 +89,10 @@ def lift_grasps(
 
 
 def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry, ...]:
-    """Run the trial of the first of several grasps, and trials of others where a lift fails.
+    """Lift the object with the first of several `grasps`; after a failed lift, try another one.
 
-    Return all tries, at most `tries`. The robot's part is `GraspTry`; the simulation opens a scene
-    for each try.
+    Return all tries, at most `tries`. `driver` has checked the trial, and opens a fresh simulated
+    scene for each try. `GraspTry` chooses the next grasp.
     """
     done = list[LiftTry]()
     run: TrialRun | None = None

@@ -185,7 +185,8 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     * "causes": for each `ProtocolResult.cause` its "count" and the counts "by_group". "median" is
       that of `ProtocolResult.size`, in the unit of the cause, or NaN.
     * "fingers": numbers of views with an executable grasp, by the grasping fingers.
-    * "force_n" [N], "overlap_mm" [mm], "plan_cpu_s" [s], "trial_cpu_s" [s]: means, or None.
+    * "force_n" [N], "overlap_mm" [mm], "plan_cpu_s" [s], "trial_cpu_s" [s]: means, or None without
+      values.
     * "overlap_mm_max": largest overlap [mm], or None. "cpu_s": total CPU time [s].
     * "slip_mm" [mm], "slip_deg" [deg]: (median, 95 % quantile) over the trials that passed, or
       None.

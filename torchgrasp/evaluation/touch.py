@@ -34,10 +34,12 @@ class TouchNumbers:
     """Parameters of the verdict on touching fingertips."""
 
     limit: float = 0.003
-    """Greatest gap [m] of a fingertip that touches: the usual deviation of an estimated surface."""
+    """Greatest gap [m] at which a fingertip counts as touching: the usual deviation of an estimated
+    surface.
+    """
     reach: float = 1.5
     """Greatest distance of a fingertip from the cloud's nearest point, along the surface, in
-    spacings of the points. Farther away, the cloud does not show the surface.
+    multiples of the points' spacing. Farther away, the cloud does not show the surface.
     """
 
 

@@ -52,13 +52,15 @@ class TrialNumbers:
     """Parameters of a simulated trial of a grasp."""
 
     unit_error: float = 1e-4
-    """Greatest error of the length of the approach, a unit vector."""
+    """Greatest deviation from 1 of the length of the approach, a unit vector."""
     speed: float = 0.2
     """Mean speed [m/s] of an unguarded approach."""
     slack: float = 0.03
-    """Distance [m] from contacts within which the mesh may lie: objects may be misplaced a bit."""
+    """Greatest distance [m] between contacts and mesh: objects may be a bit misplaced."""
     relooked: float = 1.5
-    """Extra range of the hand's mount after a second look, over the largest shift of `relocate`."""
+    """Factor by which the simulated hand's range of motion, after a second look, exceeds the
+    largest shift of `relocate`.
+    """
 
 
 TRIALS = TrialNumbers()
@@ -128,7 +130,10 @@ class GraspTrial:
 
 
 def check_truth(trial: GraspTrial) -> None:
-    """Raise `BadArgument` if the grasps of a trial all but miss its mesh, as in another frame."""
+    """Raise `BadArgument` if over 70 % of the trial's contacts are over 30 mm off its mesh. The
+    grasps are then probably in another frame. It is also raised if the mesh does not stand on the
+    planned table.
+    """
     mesh = read_mesh(trial.truth.mesh)
     check_contacts(trial.grasp, mesh, TRIALS.slack, AGREEMENT.astray)
 
@@ -136,7 +141,8 @@ def check_truth(trial: GraspTrial) -> None:
 class TrialDriver:
     """A trial that is checked once and can run any number of times.
 
-    A bad trial raises the errors of `close_hand`.
+    Its constructor raises `BadArgument` for an invalid trial, and `MeshError` for a bad mesh, as
+    `close_hand` does.
 
     Attributes:
         spec: the parameters of the trial, with friction and mass drawn by the trial's seed.
@@ -238,10 +244,11 @@ class TrialDriver:
 
 
 def true_table(grasps: Grasps, truth: Truth) -> Plane:
-    """Return the table of a `truth`; if it is None, a level one at the mesh's lowest point.
+    """Return the table of a `truth`, in the frame of the grasp. If it has none, return a level
+    table at the mesh's lowest point.
 
-    The level one ends where the table of the `grasps` ends. Raises `BadArgument` if the plane of
-    that edge is all but level.
+    The level table ends where the table of the `grasps` ends. Raises `BadArgument` if the plane of
+    that edge is almost level.
     """
     if truth.table is not None:
         return truth.table
@@ -279,11 +286,11 @@ def derive_reference(
         hand: the hand of the grasp.
         grasp: a single grasp.
         table: the table in the frame of the grasp; None if unknown.
-        surface: the estimated surface of the object; None if unknown.
-        closing: the mode of the closing.
+        surface: the estimated surface of the object, in the frame of the grasp; None if unknown.
+        closing: the closing mode, such as "uncertainty" (`TrialSpec`).
         force: normal force [N] of the strongest finger.
         kp: stiffness of every joint's drive [N m/rad]; None means the hand's own.
-        sensor: noise of the fingertip sensors; None means that of the plan.
+        sensor: model of the fingertip sensors; None means `SensorModel()`.
         max_force: greatest normal force [N] of a fingertip; None means no limit.
     """
     preference = choose_preference(hand, closing)
@@ -297,7 +304,8 @@ def derive_reference(
 class TrialRun:
     """One run of a trial in a fresh scene.
 
-    Its phases are iterators that yield after every control tick.
+    Its phases `approach` and `close` are iterators that yield after every control tick, a period of
+    the controller.
     """
 
     def __init__(self, driver: TrialDriver) -> None:
@@ -337,14 +345,14 @@ class TrialRun:
     @property
     def starts(self) -> bool:
         """Whether the trial starts: the opened hand penetrates other bodies and itself by at most
-        `TrialSpec.overlap`.
+        `TrialSpec.overlap`, by default 1 mm.
         """
         return self.overlap <= self.spec.overlap
 
     def keep(self) -> "Callable[[], TrialRun]":
         """Return a function that returns new runs in the present state of this one.
 
-        They continue bitwise as this one does.
+        The new runs continue with bitwise the same results as this one.
         """
         reopen = self.scene.keep()
         hand = self.robot.reference.hand
@@ -354,7 +362,8 @@ class TrialRun:
     def approach(self) -> Iterator[None]:
         """Move the opened hand straight to its pre-grasp.
 
-        In a guarded approach, a touch stops the hand.
+        If the controller guards the approach, a touch stops the hand. The object may be displaced
+        halfway (`Truth.slide`).
         """
         half = 0.5 * self.spec.approach
         if self.controller.approaching:
@@ -403,8 +412,8 @@ class TrialRun:
     def hold(self, seconds: float) -> None:
         """Hold the object for a time `seconds` [s].
 
-        A hand that closed in open loop reaches its last targets one tick after its closing ends.
-        Then it keeps them, whatever it would observe.
+        A hand that closed in open loop reaches its last targets one control tick after its closing
+        ends. Then it keeps them, whatever it would observe.
         """
         ticks = self.robot.ticks(seconds)
         rests = not self.controller.closing.feels and self.controller.closed
@@ -417,7 +426,8 @@ class TrialRun:
     def felt(self) -> tuple[float, float]:
         """The controller's estimates (friction coefficient, load [N]).
 
-        Both are NaN unless it holds in the mode "grip".
+        The load is that of the object on the fingertips. Both are NaN unless the controller holds
+        in the mode "grip".
         """
         hold = self.controller.hold
         if isinstance(hold, GripHold):

@@ -27,10 +27,12 @@ def true_scene(
     body: Body,
     **others: Any,
 ) -> SceneSpec:
-    """Return the parameters of the scene in which a trial by `spec` begins.
+    """Return the parameters of the simulated scene in which a trial with the parameters `spec`
+    begins.
 
-    The hand is at `world_from_hand` [m] with its actuated `joints` [rad or m], and `body` is the
-    object. `others` are further fields of `SceneSpec`.
+    `world_from_hand` (4, 4) [m] is the pose of the hand's root link in the simulator's frame.
+    `joints` (h,) [rad or m] are its h actuated joints, and `body` is the object. `others` are
+    further fields of `SceneSpec`.
     """
     return SceneSpec(
         urdf_path=hand.urdf_path,
@@ -75,8 +77,10 @@ def true_body(
 def edge_in_world(
     table: Plane, obj_from_world: Float[Tensor, "4 4"]
 ) -> tuple[float, float, float] | None:
-    """Return the edge of a true table in the simulator's frame, as `SceneSpec` takes it; None
-    without one.
+    """Return the edge of a true table as (x, y, offset) in the simulator's frame; None without an
+    edge. (x, y) is a horizontal unit vector that points off the table, and `offset` [m] the edge's
+    position along it. `obj_from_world` [m] is the pose of the simulator's frame in the table's
+    frame.
     """
     return edge_of(rounded_table(table.moved(inverse(obj_from_world))))
 

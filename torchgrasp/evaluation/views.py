@@ -105,10 +105,10 @@ class EvaluationSpec(Value):
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
-    """Return the indices of the grasps to try.
+    """Return the indices of the grasps to try, among a view's `executable` grasps.
 
-    There are at most `most` out of `executable` grasps, which are in ranked order. `ranks` says
-    which: the "best", or grasps "spread" evenly over all ranks.
+    At most `most` indices are returned. The grasps are in the order of their ranks, the best first.
+    `ranks` says which are tried: the "best", or grasps "spread" evenly over all ranks.
     """
     most = min(most, executable)
     if ranks == "best" or most < 2:
@@ -127,8 +127,8 @@ class ObjectView:
 
     @property
     def score(self) -> ViewScore:
-        """The result for the view before planning, without grasps: names of object, view, family
-        and group.
+        """A result for the view before planning. It has the names of object, view, family and
+        group, but no grasps.
         """
         entry = read_entry(self.objects, self.object)
         return ViewScore(self.object, self.view, 0, 0.0, family=entry.family, group=entry.group)
@@ -138,7 +138,7 @@ class ObjectView:
         return folder / self.object / f"{self.view}.safetensors"
 
     def load_hand(self) -> Hand:
-        """Load the hand of the view, with its fingers."""
+        """Load the hand of the view, with the fingers that grasp."""
         return load_hand(self.hand.urdf_path.parent, self.hand.option)
 
 
@@ -153,7 +153,8 @@ class PlannedView(NamedTuple):
 def plan_views(
     views: Sequence[ObjectView], protocol: Protocol, spec: EvaluationSpec, device: str
 ) -> list[Grasps | None]:
-    """Plan on several views at once on a torch `device`; return the executable grasps of each.
+    """Plan on several views at once on a torch `device`. Return the executable grasps of each view,
+    those that passed all checks.
 
     `protocol` gives the task of the grasps, and `spec` the options of planning.
 
@@ -192,11 +193,12 @@ def _plan(
 def plan_view(
     view: ObjectView, protocol: Protocol, spec: EvaluationSpec, planned: Path | Grasps | None = None
 ) -> PlannedView:
-    """Return the executable grasps of a view for a protocol, with its score; `spec` has the options
-    of planning.
+    """Return the executable grasps of a view for a protocol, with the view's score. Executable
+    grasps passed all checks of the planner. `spec` has the options of planning.
 
-    The score says why there are none. `planned` are grasps that exist already: the path of their
-    file, or what `plan_views` returned. None, or a plan without grasps, means to plan them here.
+    If there are none, the score's `refusal` says why. `planned` are grasps that exist already: the
+    path of their file, or what `plan_views` returned. With None, or if these grasps are none, the
+    view is planned here.
     """
     hand = view.load_hand()
     score = view.score
@@ -259,7 +261,8 @@ def try_grasp(
     the result.
 
     If a lift fails and the protocol allows more tries, the other `grasps` follow. Raises
-    `BadArgument` if the protocol looks again from a view without the camera's position.
+    `BadArgument` if the protocol has a second look (`Protocol.relook`), but the view's camera
+    position is unknown.
     """
     others = [k for k in range(len(grasps)) if k != at[0] and protocol.tries > 1]
     grasp = grasps[[at[0], *others]]

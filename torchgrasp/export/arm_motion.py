@@ -63,8 +63,8 @@ def plan_motion(
             fingers press.
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
 
-    Raises `BadArgument` for grasps that were planned without this arm or with it at another place.
-    It is also raised for joints of another hand.
+    Raises `BadArgument` for grasps that were planned without this arm, or with another pose of its
+    base. It is also raised for joints of another hand.
 
     >>> grasps = plan_grasps(cloud, hand, spec, arm=arm)  # doctest: +SKIP
     >>> motion = plan_motion(arm, hand, grasps[:1])  # doctest: +SKIP

@@ -42,9 +42,11 @@ POSTURE = PostureNumbers()
 
 
 class Column(NamedTuple):
-    """One joint of a file. Its value in our hand is `factor` times the file's, plus `offset`.
+    """One joint of another program's file. Its value in our hand is `factor` times the file's
+    value, plus `offset`.
 
-    `offset` is in rad, or in m for a sliding joint. `turned` says whether the user gave a factor.
+    `joint` is its name in the hand's URDF. `offset` is in rad, or in m for a sliding joint.
+    `turned` says whether the user gave a factor.
     """
 
     joint: str
@@ -54,12 +56,12 @@ class Column(NamedTuple):
 
 
 def read_order(hand: Hand, order: Sequence[str]) -> tuple[Column, ...]:
-    """Return the columns of a file, given the words of an `order`: JOINT, JOINT:FACTOR or
-    JOINT:FACTOR:OFFSET.
+    """Return the joints of a file's postures, one for each number. The words of `order` are JOINT,
+    JOINT:FACTOR or JOINT:FACTOR:OFFSET.
 
-    A word that starts with no joint of the hand is kept as its name. Raises `BadArgument` for an
-    actuated joint that is missing, or a name twice. Raises it also for a factor that is no number
-    or 0.
+    A word that does not start with a joint of the hand names a joint that is not read. Raises
+    `BadArgument` for an actuated joint that is missing, or a name twice. Raises it also for a
+    factor that is no number or 0.
     """
     columns = list[Column]()
     for word in order:
@@ -93,12 +95,12 @@ def _numbers(words: str) -> list[float]:
 def read_columns(
     hand: Hand, columns: Sequence[Column], table: np.ndarray, refuse: Refuse
 ) -> dict[str, np.ndarray]:
-    """Return the values (g,) [rad or m] of each joint of our hand by name, given the file's `table`
-    (g, columns).
+    """Return the values (g,) [rad or m] of the hand's joints in g grasps, by name. `table` has the
+    file's values, a row for each grasp and a column for each of `columns`.
 
     A `GraspFileWarning` names the values that are not read, and the joints that bend backward in
-    every grasp. Raises the error of `refuse` for joints beyond their limits that fit with the other
-    sign.
+    every grasp. Raises the error that `refuse` makes for joints beyond their limits that fit with
+    the other sign.
     """
     unread = list[str]()
     turned = dict[str, str]()  # what was found, by JOINT:-1
@@ -157,12 +159,13 @@ def _is_backward(values: np.ndarray, low: float, high: float) -> bool:
 def read_posture(
     hand: Hand, values: dict[str, np.ndarray], what: str, refuse: Refuse
 ) -> Float[Tensor, "g h"]:
-    """Return the actuated joints [rad] of the hand on the CPU, given the file's `values` (g,) of
-    its joints by name.
+    """Return the h actuated joints [rad or m] of the hand in g grasps, on the CPU. `values` holds
+    the file's values (g,) of its joints by name.
 
     All values together must put each fingertip where the actuated joints alone put it, to 0.1 mm.
-    Else the error of `refuse` is raised, which names the joint. A `GraspFileWarning` names joints
-    of other fingers, whose values are not kept. `what` names the posture.
+    Else the error that `refuse` makes is raised, which names the joint. A `GraspFileWarning` names
+    joints of fingers that do not grasp, whose values are not kept. `what` is the posture's name in
+    these texts.
     """
     joints = torch.tensor(np.stack([values[name] for name in hand.joint_names], axis=1))
     own = hand.expand_joints(joints)
@@ -219,10 +222,11 @@ class _Fingers(Batch):
 def reach_tips(
     hand: Hand, joints: Float[Tensor, "g h"], tips: Float[Tensor, "g f 3"]
 ) -> tuple[Float[Tensor, "g h"], Float[Tensor, "g"]]:
-    """Return joints [rad] within their limits that bring the pads to `tips` [m] in the palm's
-    frame. Return also the distance [m] that is left to the farthest tip.
+    """Return h actuated joints [rad or m] within their limits that bring the contact points of f
+    fingertips to `tips` [m]. Return also the greatest distance [m] that is left between them, for
+    each of g grasps.
 
-    The search starts at `joints`.
+    `tips` are in the frame of the hand's root link. The search starts at `joints`.
     """
 
     def errors(state: _Fingers, rows: Int[Tensor, "a"]) -> Residuals:

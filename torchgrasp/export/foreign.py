@@ -54,14 +54,19 @@ LEAST = 1e-12  # least length [m] by which a position is divided
 
 @dataclasses.dataclass(frozen=True)
 class OrderNumbers:
-    """Bounds by which the quaternions of a file are found to have another order."""
+    """Bounds by which the quaternions of a file are found to have another order than assumed. In
+    the right order, the object's origin is on one side of most hands.
+    """
 
     grasps: int = 8
-    """Fewest grasps that tell: of fewer, one side may be chance."""
+    """Least number of grasps from which the order is judged: of fewer, one side may be chance."""
     one_side: float = 0.9
-    """Least length of the mean direction of the origin in the hands' frames, if it is on one side."""
+    """Least length of the mean unit vector to the object's origin, in the hands' frames. From this
+    length on, the origin counts as on one side.
+    """
     any_side: float = 0.6
-    """Greatest such length in the order that is told to be wrong."""
+    """Greatest length of this mean in the assumed order at which the assumed order is judged wrong.
+    """
 
 
 ORDER = OrderNumbers()
@@ -90,8 +95,8 @@ class ForeignGrasps(NamedTuple):
         joints: positions (g, h) [rad or m] of the actuated joints, in the order of
             `hand.joint_names`.
         obj_from_hand: poses (g, 4, 4) [m] of the hand's root link in the object's frame.
-        pregrasp: positions (g, h) [rad or m] of the opened hand's joints; None if the file has
-            none.
+        pregrasp: positions (g, h) [rad or m] of the opened hand's actuated joints; None if the file
+            has none.
         table: the table under the object, in the object's frame; None if the file has none.
     """
 

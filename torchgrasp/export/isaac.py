@@ -173,9 +173,9 @@ def _root_from_link(hand: Hand, grasps: Grasps, link: str) -> Float[Tensor, "*g 
 class IsaacFile(NamedTuple):
     """The content of an `isaac_grasp` file with g grasps, in its order.
 
-    `poses` (g, 7) are position and quaternion (w, x, y, z) of the frame `gripper`, "" if the file
-    names none. `postures` has "grasp" and, if the file has them, "pregrasp": values (g,) by the
-    names of the joints.
+    `gripper` is the name of the gripper's frame, or "" if the file names none. `poses` (g, 7) are
+    the frame's position [m] and quaternion (w, x, y, z) in the object's frame. `postures` has
+    "grasp" and, if the file has it, "pregrasp": joint values (g,) [rad or m] by joint name.
     """
 
     gripper: str
@@ -184,13 +184,13 @@ class IsaacFile(NamedTuple):
 
 
 def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -> IsaacFile:
-    """Return the content of an `isaac_grasp` file of at most `most` grasps, with numbers up to
-    `far`.
+    """Return the content of an `isaac_grasp` file of at most `most` grasps. No number may exceed
+    `far` in size.
 
-    A `GraspFileWarning` names keys that are not read. It tells if neither the first line nor the
-    gripper's path names a hand. A hand of the other side may have the same joints. Raises the error
-    of `refuse` for a malformed file, another version, or our own file of another hand. Raises it
-    also for a joint that the hand does not have, and for an actuated joint that is missing.
+    A `GraspFileWarning` names keys that are not read. The warning also says if neither the first
+    line nor the gripper's path names a hand: a left hand may have the joints of a right one. Raises
+    the error that `refuse` makes for a malformed file, another version, or our own file of another
+    hand. It is also raised for a joint that the hand does not have, or a missing actuated joint.
     """
     data = read_bounded(path, JSON_BYTES, ALLOWED, refuse)
     content = _read_yaml(path, data, refuse).entries("format", "format_version", "grasps")

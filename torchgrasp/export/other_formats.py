@@ -137,10 +137,10 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
 
 
 def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
-    """Return the root link's pose [m] in DexGraspBench's hand frame, then the joint names in the
-    bench's order.
+    """Return the pose [m] of the hand's root link in DexGraspBench's frame of the hand. Then return
+    the joint names in DexGraspBench's order.
 
-    They are the identity and () for a hand that the bench does not have.
+    They are the identity and () for a hand that DexGraspBench does not have.
     """
     turn, order = BENCH_HANDS.get(hand.name, ([0.0, 0.0, 0.0, 1.0], ()))
     rotation = torch.from_numpy(spatial.transform.Rotation.from_quat(turn).as_matrix())

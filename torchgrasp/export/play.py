@@ -64,13 +64,13 @@ class PlayNumbers:
     """Parameters of an exported motion that a simulator plays: mount, approach and lift."""
 
     room: float = 0.1
-    """Range [m] of the mount beyond approach and lift."""
+    """Range of motion [m] of the hand's mount beyond approach and lift."""
     speed: float = 0.2
     """Speed [m/s] of the approach: the mean speed in our trials."""
     lift: float = 1.0
     """Time [s] of the lift."""
     friction: float = 0.1
-    """Least coefficient of friction for which the force is chosen."""
+    """Lower bound of the coefficient of friction in the choice of the pressing force."""
     force: float = 100.0
     """Largest normal force [N] of the strongest finger, far beyond what hands exert."""
     mass: float = 0.1
@@ -177,8 +177,8 @@ def stand(surface: Surface, table: Plane | None) -> Surface:
     """Return an estimated surface whose points below the table are moved up to it, along its
     normal.
 
-    On the round base of an estimate the object would rock. Without a table, the surface is returned
-    as it is.
+    On the round base of an estimated surface the object would rock. Without a table, the surface is
+    returned as it is.
     """
     if table is None:
         return surface
@@ -238,11 +238,12 @@ def _scene(
 
 @checked
 def pressing_force(spec: TrialSpec, mass: Positive) -> float:
-    """Return the normal force [N] of the strongest finger in play: `spec.force`, or by default what
-    the object needs.
+    """Return the normal force [N] of the strongest finger in play: `spec.force`, or what the object
+    needs if that is None.
 
-    With the default, two opposite fingers hold the weight of a `mass` [kg] and a push of `PUSH`.
-    They use half of the friction. It is at most `spec.max_force`, or else `PLAY.force`.
+    If it is None, two opposite fingers hold the weight of a `mass` [kg] and a push of 2.5 N
+    (`PUSH`). They do so with half of the friction coefficient. This force is at most
+    `spec.max_force`, and at most 100 N (`PLAY.force`).
 
     >>> round(pressing_force(TrialSpec(friction=0.8), 0.25), 1)
     6.2
@@ -323,10 +324,10 @@ def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
 def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
     """Return the values with which the templates of USD files are filled, by name.
 
-    They are "parts", the convex parts of the object, and "links" and "joints". The last two are of
-    the hand and of the mount that carries it. Each is a list with one entry for each part, link or
-    joint. All joints are at zero. Lengths are in metres, masses in kilograms. Raises `BadArgument`
-    for names of links or joints that USD does not allow.
+    Each is a list. "parts" has an entry for each convex part of the object. "links" and "joints"
+    have one for each link or joint of the hand and of the mount that carries it. All joints are at
+    zero. Lengths are in metres, masses in kilograms. Raises `BadArgument` for names of links or
+    joints that USD does not allow.
     """
     urdf = scene.urdf
     moment = PLAY.inertia

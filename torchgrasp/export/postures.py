@@ -147,8 +147,8 @@ def format_grasps(
 def named_postures(
     hand: Hand, grasps: Grasps, force: float, kp: float | None
 ) -> tuple[Squeeze, dict[str, dict[str, Float[Tensor, "g"]]]]:
-    """Return the squeeze of g grasps, then the joint positions [rad] of each posture, by name, on
-    the CPU.
+    """Return the `Squeeze` of g grasps, then the joint positions [rad or m] of each posture, by
+    name, on the CPU.
 
     The postures are "pregrasp", "grasp" and "squeeze". Each has the g positions of every joint of
     the URDF, by the joint's name. `force` [N] is the normal force of the strongest finger. `kp` [N
@@ -166,15 +166,15 @@ def named_postures(
 
 
 def stands_still(hand: Hand, grasps: Grasps) -> Bool[Tensor, "g"]:
-    """Return a mask of the grasps whose hand closes at one pose. The other hands go down while they
-    close (`opened_pose`).
+    """Return a mask of the g grasps in which the hand keeps its pose while it closes. In the others
+    it goes down while it closes, because its opened fingers would be in the table.
     """
     opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
     return (opened == grasps.obj_from_hand).all(2).all(1)
 
 
 def check_still(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` for grasps whose hand goes down while it closes.
+    """Raise `BadArgument` if the hand goes down while it closes in one of the grasps.
 
     A format with one pose for each grasp cannot express them.
     """
@@ -184,7 +184,8 @@ def check_still(hand: Hand, grasps: Grasps) -> None:
 
 
 def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str]:
-    """Return the robot's name of each joint of the URDF: those of `rename` first, in its order.
+    """Return the robot's name of each joint of the hand's URDF. The joints in `rename` come first,
+    in its order; None keeps all names.
 
     Raises `BadArgument` for joints that the hand lacks, and for equal or empty names.
     """
@@ -207,7 +208,9 @@ def follower_joints(hand: Hand) -> tuple[str, ...]:
 
 
 def describe_pose(a_from_b: Float[Tensor, "4 4"]) -> dict[str, list[float]]:
-    """Return the pose `a_from_b` [m] by name, as "position" [m] and unit "quaternion_wxyz"."""
+    """Return a pose as a dict with "position" [m] and the unit quaternion "quaternion_wxyz".
+    `a_from_b` [m] is the pose of frame b in frame a.
+    """
     return {"position": a_from_b[:3, 3].tolist(), "quaternion_wxyz": quaternion(a_from_b)}
 
 

@@ -31,8 +31,8 @@ def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[st
 
     `points` (n, 3) are the columns x, y and z. `normals` (n, 3) are nx, ny and nz, or None. `other`
     lists the names of the other columns. Capitals, and names such as normal_x, are understood. Each
-    of the `columns` is an array (n,) or (n, k), of which the first number counts. Raises
-    `Malformed` for a missing or double column.
+    of the `columns` is an array (n,) or (n, k); of k numbers a line, the first counts. `names` are
+    their names. Raises `Malformed` for a missing or double column.
     """
     places = dict[str, int]()
     other = list[str]()
@@ -72,8 +72,8 @@ def read_fields(
         order: byte order of binary data, "<" or ">"; "" means that the data are text.
         last: whether the table ends the data; otherwise anything may follow it.
 
-    Raises `Malformed` for too little data. With `last`, data of a further line raise it, too. So
-    does a first line of text with a wrong number of values.
+    Raises `Malformed` for too little data. With `last`, it is also raised for data of a further
+    line, or a wrong number of values in the first.
     """
     if not 0 <= count <= CLOUD_POINTS:
         raise Malformed(f"{count} points, not up to {CLOUD_POINTS}")
@@ -126,7 +126,8 @@ def _count_words(data: bytes) -> int:
 
 
 def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
-    """Return the columns of a text, as `find_columns` does, by the names in its first line.
+    """Return the points, and normals if any, in the columns of a text. The names in its first line
+    say which column is which (`find_columns`).
 
     `data` is the content of the file. Without names there must be three or six columns, and the
     dictionary holds one array `columns` (n, 3) or (n, 6). A first line of one number counts the

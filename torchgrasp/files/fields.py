@@ -38,10 +38,11 @@ DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)  # dtypes in ou
 
 
 class Field(NamedTuple):
-    """A value in a JSON or TOML file, with its place in the file.
+    """A value in a JSON or TOML file, with the file's path and the field's name.
 
     `path` is the file. `place` names the field, such as `objects.cup`, "" for the whole file.
-    `refuse(found, allowed)` makes the error for a bad value.
+    `refuse(found, allowed)` makes the error for a bad value. It is the error that all methods raise
+    for a value that they do not accept.
     """
 
     path: Path
@@ -50,7 +51,9 @@ class Field(NamedTuple):
     refuse: Refuse
 
     def wrong(self, allowed: str) -> BadArgument:
-        """Return the error for a bad value of this field; `allowed` says what is expected."""
+        """Return the error for a bad value of this field, made by `refuse`. `allowed` says what is
+        expected.
+        """
         try:
             text = repr(self.value)[: SHOWN_LETTERS + 1]
         except ValueError:  # Python writes no whole number of more than 4300 digits
@@ -61,7 +64,8 @@ class Field(NamedTuple):
     def entries(self, *required: str) -> "dict[str, Field]":
         """Return the entries of a JSON object as fields, by name.
 
-        Raises the error of `wrong` if the value is no object, or lacks one of the `required` names.
+        Raises the error that `refuse` makes if the value is no object, or lacks one of the
+        `required` names.
         """
         if not isinstance(self.value, dict):
             raise self.wrong("an object { }")
@@ -74,8 +78,8 @@ class Field(NamedTuple):
         }
 
     def items(self, most: int = 1000) -> "list[Field]":
-        """Return the items of a list as fields; raise the error of `wrong` for more than `most`
-        items.
+        """Return the items of a list as fields. Raises the error that `refuse` makes for another
+        value, or for more than `most` items.
         """
         if not isinstance(self.value, list) or len(self.value) > most:
             raise self.wrong(f"a list of at most {most}")
@@ -84,16 +88,16 @@ class Field(NamedTuple):
         ]
 
     def text(self, most: int = JSON_LETTERS) -> str:
-        """Return the value as a text of at most `most` letters; raise the error of `wrong` for
-        another value.
+        """Return the value as a text of at most `most` letters. Raises the error that `refuse`
+        makes for another value.
         """
         if not isinstance(self.value, str) or len(self.value) > most:
             raise self.wrong(f"a text of at most {most} letters")
         return self.value
 
     def number(self, low: float = -sys.float_info.max, high: float = sys.float_info.max) -> float:
-        """Return the value as a number in [low, high], by default any finite number; else raise the
-        error of `wrong`.
+        """Return the value as a number in [low, high], by default any finite number. Raises the
+        error that `refuse` makes for another value.
         """
         number = self.value
         if (
@@ -111,15 +115,17 @@ class Field(NamedTuple):
     def numbers(
         self, count: int, low: float = -sys.float_info.max, high: float = sys.float_info.max
     ) -> list[float]:
-        """Return the value as a list of `count` numbers in [low, high]; else raise the error of
-        `wrong`.
+        """Return the value as a list of `count` numbers in [low, high]. Raises the error that
+        `refuse` makes for another value.
         """
         if not isinstance(self.value, list) or len(self.value) != count:
             raise self.wrong(f"{count} numbers")
         return [x.number(low, high) for x in self.items(count)]
 
     def whole(self, low: int, high: int) -> int:
-        """Return the value as a whole number in [low, high]; else raise the error of `wrong`."""
+        """Return the value as a whole number in [low, high]. Raises the error that `refuse` makes
+        for another value.
+        """
         if (
             isinstance(self.value, bool)
             or not isinstance(self.value, int)
@@ -151,8 +157,8 @@ def _refuse_constant(name: str) -> float:
 def save_tensors(
     path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]
 ) -> Path:
-    """Write tensors and metadata (`meta`) by name to a safetensors file of a `kind`; return its
-    path.
+    """Write tensors and metadata (`meta`) by name to a safetensors file, and return its path.
+    `kind` is a word, such as "grasps", that the file's metadata get.
 
     Raises `OutputError` if the file cannot be written.
     """
@@ -163,8 +169,8 @@ def save_tensors(
 def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> bytes:
     """Return the bytes of a safetensors file with tensors and metadata (`meta`) by name.
 
-    The metadata also name the `kind` of the file and the version of its layout. Equal tensors and
-    metadata give equal bytes.
+    The metadata also hold the `kind` of the file, a word such as "grasps", and the version of its
+    layout. Equal tensors and metadata give equal bytes.
     """
     contiguous = {
         name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()
@@ -180,11 +186,12 @@ def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) ->
 def load_tensors(
     path: Path | str, kind: str, names: set[str], optional: Collection[str] = ()
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return the tensors and the metadata of a safetensors file of a `kind`, each by name.
+    """Return the tensors and the metadata of a safetensors file, each by name.
 
-    The file must hold the tensors `names`, and may hold those in `optional`. Raises
-    `ModelFileError` for a missing or broken file, another kind or version, and other tensors.
-    Raises it also for numbers that are not finite or above `LARGEST_NUMBER`.
+    `kind` is the word for its content, such as "grasps", that the file's metadata must hold. The
+    file must hold the tensors `names`, and may hold those in `optional`. Raises `ModelFileError`
+    for a missing or broken file, another kind or version, and other tensors. Raises it also for
+    numbers that are not finite, or greater than 1e30 in size.
     """
     allowed = names.union(optional)
     refuse = functools.partial(ModelFileError, "path")
@@ -217,11 +224,13 @@ def load_tensors(
 def read_value(
     path: Path | str, kind: str, of: type[SomeValue], **rest: Any
 ) -> tuple[SomeValue, dict[str, str]]:
-    """Return a value of class `of`, and the metadata by name, from a safetensors file of a `kind`.
+    """Return a value of class `of`, and the metadata by name, from a safetensors file.
 
-    The tensors of the file have the names of the fields of class `of`. `rest` gives the fields that
-    are no tensors; those left out keep their defaults. Raises the errors of `load_tensors`. Raises
-    `ModelFileError` for a tensor whose shape or dtype is not that of the field's annotation.
+    `kind` is the word for its content, such as "grasps", that the file's metadata must hold. The
+    tensors of the file have the names of the fields of class `of`. `rest` gives the fields that are
+    no tensors; those left out keep their defaults. Raises `ModelFileError` for a missing or broken
+    file, another kind or version, and wrong tensors or numbers (`load_tensors`). It is also raised
+    for a tensor whose shape or dtype is not that of the field's annotation.
     """
     fields = _tensor_fields(of)
     optional = {name for name, kinds in fields.items() if type(None) in kinds}
@@ -278,7 +287,7 @@ def _is_value(hint: Any) -> bool:
 
 
 class Recent(Generic[Item]):
-    """A cache of the last items that were read, each by its number.
+    """A cache of the items that were read last, each under an integer that identifies it.
 
     `most` is the number of items kept, and `kept` holds them. A copy in another process starts
     empty.
@@ -289,7 +298,9 @@ class Recent(Generic[Item]):
         self.kept: dict[int, Item] = {}
 
     def get(self, number: int, read: Callable[[int], Item]) -> Item:
-        """Return the item of a number; `read(number)` reads it if it is not in the cache."""
+        """Return the item that `number` identifies; `read(number)` reads it if it is not in the
+        cache.
+        """
         item = self.kept.pop(number, None)
         item = read(number) if item is None else item
         self.kept[number] = item  # now the last one

@@ -81,9 +81,11 @@ class Malformed(ValueError):
 
 
 def explain(error: Exception) -> str:
-    """Return a sentence that says what is wrong with a file on which a parser raised `error`.
+    """Return a sentence that says what is wrong with a file that could not be parsed; `error` is
+    the parser's error.
 
-    For errors of other libraries the sentence is a general one.
+    For a `Malformed` it is the error's own text. For errors of other libraries it is a general
+    sentence.
     """
     return str(error) if isinstance(error, Malformed) else "a content that is broken or cut off"
 
@@ -97,8 +99,8 @@ def is_file(path: Path | str) -> bool:
 
 
 def read_bytes(path: Path | str) -> bytes:
-    """Return the content of a file, at most as many bytes as its reported size: some system files
-    never end.
+    """Return the content of a file. No more bytes are read than the size that the system reports,
+    because some system files never end.
     """
     with Path(path).open("rb") as file:
         return file.read(os.fstat(file.fileno()).st_size)
@@ -107,8 +109,8 @@ def read_bytes(path: Path | str) -> bytes:
 def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> bytes:
     """Return the content of a regular file of at most `most` bytes.
 
-    For another file, and a pointer of Git LFS, the error `refuse(found, allowed)` is raised;
-    `allowed` says what is expected.
+    For a larger file, anything else, or a pointer of Git LFS, the error `refuse(found, allowed)` is
+    raised. `allowed` says what is expected.
     """
     check_file(path, most, allowed, refuse)
     try:
@@ -225,9 +227,9 @@ def hold_file(path: Path) -> Iterator[None]:
 def begin_folder(path: Path, content: str, what: str) -> None:
     """Write the file `path` with a text `content` that describes its folder.
 
-    Nothing is written if the file has this content already. Raises `OutputError` if it has another
-    content, or if the folder holds other files but not this one. `what` names the folder's objects
-    in errors.
+    Nothing is written if the file has this content already. Raises `OutputError` if the file has
+    another content, or if the folder holds other files but not this one. `what` is a word for the
+    folder's content in errors, such as "campaigns".
     """
     check_begun(path)
     if not path.exists():

@@ -32,12 +32,12 @@ SomeBatch = TypeVar("SomeBatch", bound="Batch")
 
 
 def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValue:
-    """Return a value whose tensors are a function of the tensors in the same field of several
-    values.
+    """Return a value in which each tensor is the result of `function`, called with that field's
+    tensors in all `values`.
 
-    `function` is called with one tensor from each of the `values`, which are of one class. Values
-    in fields are mapped, too. Fields without tensors are copied from the first value. Raises
-    `BadArgument` if a field holds a tensor in some of the values only.
+    The `values` are of one class; `function` gets one tensor from each. Values in fields are
+    mapped, too. Fields without tensors are copied from the first value. Raises `BadArgument` if a
+    field holds a tensor in some of the values only.
     """
 
     def merge(name: str, *found: Any) -> Any:
@@ -238,7 +238,8 @@ class Batch(Value):
 
 
 def read_rows(rows: Any, count: int) -> slice | Tensor:
-    """Return any index of a batch of `count` rows as a slice, or as a tensor of indices (k,).
+    """Return any index of a batch of `count` rows as a slice, or as a tensor of indices (k,). A row
+    is what belongs to one index of the batch's first axis.
 
     `rows` is an index, a slice, a mask (count,), or a list or tensor (k,) of indices. Indices of a
     list or tensor are not compared with `count`. Raises `BadArgument` for anything else, such as a
@@ -270,15 +271,15 @@ def read_rows(rows: Any, count: int) -> slice | Tensor:
 
 
 def join(parts: Sequence[SomeBatch]) -> SomeBatch:
-    """Return batches concatenated along the rows; fields without tensors are copied from the first
-    batch.
+    """Return one batch: the tensors of several batches, concatenated along their first axis. Fields
+    without tensors are copied from the first batch.
     """
     return map_tensors(lambda *tensors: torch.cat(tensors), *parts)
 
 
 def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch:
     """Return a batch that takes each row from `new` where `choose` is True, and from `old` where it
-    is False.
+    is False. A row is what belongs to one index of the first axis.
     """
     return map_tensors(
         lambda a, b: torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b), new, old
@@ -286,8 +287,8 @@ def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch
 
 
 def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
-    """Return a copy of the batch `whole` in which the rows of `part` replace the rows at the
-    indices `at`.
+    """Return a copy of the batch `whole` in which the rows of `part` replace those at the indices
+    `at`. A row is what belongs to one index of the first axis.
     """
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
@@ -307,8 +308,8 @@ def spread(value: float | Tensor, like: Tensor, own: int = 0) -> float | Tensor:
 def at_once(x: Tensor, size: int) -> int:
     """Return how many rows of the tensor `x` to process at a time.
 
-    The number is `size` on a CPU, whose cache then holds all temporaries, and `ROWS_ON_GPU` times
-    `size` on an accelerator.
+    On a CPU the number is `size`, so that its cache holds all temporaries. On an accelerator it is
+    256 times `size` (`ROWS_ON_GPU`).
     """
     return size if x.device.type == "cpu" else ROWS_ON_GPU * size
 
@@ -333,11 +334,12 @@ def map_rows(
     axes: tuple[int | None, ...],
     arguments: tuple[Tensor, ...],
 ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    """Return the results of a function of rows where torch.vmap maps over it, and their axes.
+    """Return the results of a function of several rows (n, ...) under torch.vmap, and the axes of
+    the mapped entries in them.
 
-    It serves as `vmap` of a torch.autograd.Function. The rows of all mapped entries are computed
-    together. `size` is the number of entries, and `axes` are their axes in the `arguments`. None
-    means the same argument for all. In the results the axis is 0.
+    It serves as the method `vmap` of a torch.autograd.Function. The rows of all mapped entries are
+    computed in one call. `size` is the number of entries, and `axes` are their axes in the
+    `arguments`. None means that all entries share the argument. In the results this axis is 0.
     """
     parts = [
         x.expand(size, *x.shape) if axis is None else x.movedim(axis, 0)
@@ -354,7 +356,7 @@ def row_numbers(rows: Tensor) -> Int[Tensor, "n"]:
 
 
 def flatnonzero(mask: Bool[Tensor, "n"]) -> Int[Tensor, "k"]:
-    """Return the indices of the entries of a mask that are True, ascending."""
+    """Return the indices (k,) of the k entries of a mask (n,) that are True, ascending."""
     return torch.nonzero(mask)[:, 0]
 
 
@@ -400,8 +402,8 @@ def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
 
 
 def settle(value: SomeValue, device: torch.device) -> SomeValue:
-    """Return a value on a device; a value that is already there is returned itself, with its
-    caches.
+    """Return a value on a device. A value that is already on it is returned itself, with its cached
+    properties.
     """
     there = all(x.device == device for x in named_tensors(value).values())
     return value if there else value.to(device)
@@ -420,8 +422,8 @@ def check_device(name: str, found: torch.device, beside: str, wanted: torch.devi
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
-    """Return the number of rows with each status code, as a dict that begins with the most frequent
-    status.
+    """Return how often each `Status` occurs in a tensor of status codes, the most frequent one
+    first.
     """
     codes, counts = torch.unique(status, return_counts=True)
     pairs = sorted(zip(codes.tolist(), counts.tolist(), strict=True), key=lambda p: (-p[1], p[0]))
@@ -429,7 +431,7 @@ def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
 
 
 def check_whole(name: str, value: Any, low: int, high: int) -> None:
-    """Raise `BadArgument` unless a value is a whole number in [low, high]. Errors call it by
-    `name`.
+    """Raise `BadArgument` unless a value is a whole number in [low, high]. `name` is the value's
+    name in the error.
     """
     read_number(name, value, int, Range(low, high))

@@ -68,11 +68,13 @@ def _suggest(found: str, allowed: str) -> str:
 
 
 class TooFewPoints(BadArgument):
-    """A cloud has too few points to estimate a surface."""
+    """A cloud has too few points to estimate a surface, mostly fewer than 4 distinct ones."""
 
 
 class SuspiciousScale(BadArgument):
-    """A cloud or a mesh is too small or too large to grasp; its unit may be millimetres."""
+    """A cloud or a mesh is too small or too large to grasp. Mostly it is under 5 mm or over 2 m,
+    and its unit may be millimetres.
+    """
 
 
 class NoSupport(BadArgument):
@@ -203,7 +205,7 @@ class TableLeft(CloudWarning):
 
 
 class FewPoints(CloudWarning):
-    """The cloud has too few points to show a shape."""
+    """The cloud has too few points to show a shape: fewer than 100."""
 
 
 class Flat(CloudWarning):

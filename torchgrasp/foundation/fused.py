@@ -42,7 +42,8 @@ def has_numba() -> bool:
 def can_compile() -> bool:
     """Return whether numba can be imported, and is new enough.
 
-    Another package may have brought one that is too old, also for the installed NumPy.
+    A numba that another package installed may be too old, or unable to work with the installed
+    NumPy.
     """
     try:
         numba = importlib.import_module("numba")
@@ -52,11 +53,11 @@ def can_compile() -> bool:
 
 
 def is_fused(*tensors: Tensor) -> bool:
-    """Return whether compiled loops are on and can compute with these tensors. They can with
-    float64 on the CPU, which torch neither differentiates nor maps over.
+    """Return whether compiled loops are on and can compute with all of these tensors. They can if a
+    tensor is float64 on the CPU, needs no gradient, and is not inside torch.vmap.
 
-    Raises `MissingExtra` if they are demanded without numba, and `BadArgument` for another value of
-    `VARIABLE` than "0", "1" or none.
+    Raises `MissingExtra` if the environment has TORCHGRASP_FUSED=1, but numba is not installed.
+    Raises `BadArgument` for a value of TORCHGRASP_FUSED other than "0", "1" or none.
     """
     return are_on() and all(
         x.dtype == torch.float64 and x.device.type == "cpu" and is_known(x) and not is_tracked(x)
@@ -65,7 +66,10 @@ def is_fused(*tensors: Tensor) -> bool:
 
 
 def are_on() -> bool:
-    """Return whether compiled loops are on; raise as `is_fused` does."""
+    """Return whether compiled loops are on: TORCHGRASP_FUSED is "1", or it is unset and numba can
+    compile. Raises `MissingExtra` for "1" without numba, and `BadArgument` for values other than
+    "0" and "1".
+    """
     asked = os.environ.get(VARIABLE, "")
     if asked not in {"", "0", "1"}:
         raise BadArgument(VARIABLE, repr(asked), "0, 1, or no value")
@@ -75,10 +79,12 @@ def are_on() -> bool:
 
 
 def compiled(function: Any) -> Any:
-    """Return a function of arrays and numbers as machine code, which is kept on the disk.
+    """Return a function of NumPy arrays and numbers, compiled by numba to machine code, which is
+    cached on the disk.
 
-    Where no folder can be written, each process compiles it. A changed constant of a module goes
-    unnoticed there: pass it as an argument.
+    Where no cache folder can be written, each process compiles the function anew. The cache does
+    not notice a changed constant of a module: pass constants as arguments. Without numba, the
+    function itself is returned.
     """
     # numba names files by this, and would miss a change of what the function calls
     digest = hashlib.sha256(_content(inspect.unwrap(function)) + repr(sorted(REORDERED)).encode())
@@ -90,7 +96,9 @@ def compiled(function: Any) -> Any:
 
 
 def inlined(function: Any) -> Any:
-    """Return a function that compiled ones call; Python cannot."""
+    """Return a function for calls from `compiled` functions, into which numba inlines it. With
+    numba, Python itself cannot call it.
+    """
     # a call would find one of several copies, of other bits in a process that has just compiled
     options = dict(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
     return _compile(function, **options)
@@ -116,6 +124,8 @@ def _content(function: Any) -> bytes:
 
 
 def array(x: Tensor, dtype: torch.dtype = torch.float64) -> np.ndarray:
-    """Return a tensor as a contiguous array, which shares its memory if it can."""
+    """Return a tensor on the CPU as a contiguous NumPy array, which shares the tensor's memory if
+    possible.
+    """
     x = x.detach() if x.requires_grad else x
     return np.ascontiguousarray(x.to(dtype).numpy())

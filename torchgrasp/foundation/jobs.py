@@ -43,11 +43,11 @@ def run_tasks(
     order of the tasks.
 
     Each task runs on one thread of a separate process. A task that takes more than `limit` [s] of
-    the process's CPU time gives `Status.TIMED_OUT`. So on a busy machine it ends at the same point.
-    One that takes ten times as long by the clock gives it, too, since it may wait for ever. On
-    Windows only this applies. A task whose process dies twice gives `Status.WORKER_DIED`. The error
-    of a task is raised in place of its result. All workers end when the caller stops iterating.
-    Raises `NoWorkers` if no process can start.
+    the process's CPU time gives `Status.TIMED_OUT`. CPU time hardly depends on how busy the machine
+    is. A task that takes ten times `limit` by the clock also gives `TIMED_OUT`, since it may wait
+    for ever. On Windows only the clock counts. A task whose process dies twice gives
+    `Status.WORKER_DIED`. The error of a task is raised in place of its result. All workers end when
+    the caller stops iterating. Raises `NoWorkers` if no process can start.
 
     Each worker imports the module of the function. It runs the caller's script only if the function
     is defined there. Tasks must hold no tensors, which processes would share; `pack` replaces them
@@ -272,7 +272,8 @@ def pack(value: Any, known: dict[int, Any] | None = None) -> Any:
     """Return a value in a form for another process; `unpack` restores it.
 
     NumPy arrays take the place of tensors, which processes would share. `known` maps the `id` of
-    each packed object to its packed form. So an object that occurs twice is sent once.
+    each object that is already packed to its packed form; None means no object. So an object that
+    occurs twice is sent once.
     """
     known = {} if known is None else known
     if id(value) in known:

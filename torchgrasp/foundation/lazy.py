@@ -50,8 +50,8 @@ class _Parts(_Late):
 
 
 def import_late(package: str, /, **modules: str) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package. It imports each of the package's own names when it is
-    first used, from the module of the package that is given by this name.
+    """Return the function `__getattr__` of a package, which imports a name when it is first used.
+    `modules` maps each name to the submodule of `package` that defines it.
     """
 
     def find(name: str) -> Any:

@@ -37,7 +37,8 @@ class Range(NamedTuple):
 class Rows(NamedTuple):
     """A rule in an annotation: a field holds a batch of as many rows as the other fields.
 
-    This number is the size of the axis `letter` in the shapes of the other fields.
+    A row is one index of the first axis. The number of rows is the size of the axis `letter` in the
+    shapes of the other fields.
     """
 
     letter: str
@@ -96,7 +97,9 @@ NUMBERS = {
 
 
 def describe(hint: Any) -> str:
-    """Return a text that says which arguments an annotation allows."""
+    """Return a text, for error messages, that says which arguments the type annotation `hint`
+    allows.
+    """
     origin = typing.get_origin(hint)
     inside = typing.get_args(hint)
     if origin is Annotated and isinstance(inside[1], Range):
@@ -189,8 +192,8 @@ def check_dense(name: str, value: Tensor, gradients: bool) -> None:
 
 
 def check_plain(name: str, value: Tensor) -> None:
-    """Raise `BadArgument` if a tensor requires a gradient or is inside torch.vmap; errors call it
-    by `name`.
+    """Raise `BadArgument` if a tensor requires a gradient or is inside torch.vmap. `name` is the
+    tensor's name in the error.
     """
     if not functorch.is_functorch_wrapped_tensor(value) and not is_tracked(value):
         return
@@ -206,7 +209,7 @@ def check_plain(name: str, value: Tensor) -> None:
 
 def check_unmasked(name: str, value: Any) -> None:
     """Raise `BadArgument` if a value is a masked array of NumPy with masked numbers, which would
-    count like the others; errors call it by `name`.
+    count like the others. `name` is the value's name in the error.
     """
     if not isinstance(value, np.ma.MaskedArray):
         return
@@ -241,8 +244,8 @@ def is_tracked(value: Tensor) -> bool:
 
 
 def is_known(value: Tensor) -> bool:
-    """Return whether Python may test the numbers of a tensor; inside torch.vmap or torch.compile it
-    may not.
+    """Return whether Python can read the numbers of a tensor. Inside torch.vmap or torch.compile it
+    cannot.
     """
     if torch.compiler.is_compiling():
         return False
@@ -253,8 +256,8 @@ def is_known(value: Tensor) -> bool:
 def show(value: Any) -> str:
     """Return a short text that shows a wrong argument.
 
-    It is a number or text itself, or the shape and dtype of a tensor. Else it is the name of the
-    type.
+    For a number or a text it is the value itself, shortened if it is long. For a tensor it is the
+    shape and dtype, and otherwise the name of the type.
     """
     if isinstance(value, Tensor):
         return f"a tensor of shape {tuple(value.shape)} and {value.dtype}"
@@ -282,7 +285,8 @@ def nearest_rotation(turn: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], 
     """Return the rotation nearest to a matrix, and the error of the matrix as an angle [deg].
 
     The error is the largest distance between a column of the matrix and the same column of the
-    rotation. It is in degrees, as for small angles. It is infinite for numbers that are not finite.
+    rotation. This distance (no unit) is taken for an angle in radians, which holds for small
+    angles, and converted to degrees. The error is infinite for numbers that are not finite.
     """
     turn = turn.double()
     if not bool(torch.isfinite(turn).all()):

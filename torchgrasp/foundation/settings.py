@@ -28,17 +28,20 @@ _state: dict[str, Any] = {"calls": 0, "products": None, "backends": []}
 
 
 def in_autocast() -> bool:
-    """Return whether torch may round the numbers of this thread to a smaller dtype."""
+    """Return whether `torch.autocast` is on in this thread, for any device. Torch may then round
+    numbers to a smaller dtype.
+    """
     return any(map(torch.is_autocast_enabled, DEVICES))
 
 
 def usual_settings() -> AbstractContextManager[None]:
     """Return a context in which torch computes in full precision, without autocast and inference
-    mode. It makes tensors on the CPU where no device is named.
+    mode. Within it, new tensors are on the CPU where no device is named.
 
-    In inference mode, no derivatives are taken in the context, too. The precision of products
-    belongs to the process: the last thread to leave sets it back. All other settings belong to the
-    thread. Raises `BadArgument` if the default dtype is neither float32 nor float64.
+    If the caller is in inference mode, gradients are off in the context. All settings belong to the
+    thread, except the precision of matrix products. That belongs to the process: the last thread to
+    leave the context restores it. Raises `BadArgument` if the default dtype is neither float32 nor
+    float64.
     """
     # the library names its dtypes; single numbers would be rounded to half precision all the same
     if torch.get_default_dtype() not in (torch.float32, torch.float64):

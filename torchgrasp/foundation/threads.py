@@ -41,10 +41,10 @@ def one_thread() -> Iterator[None]:
 
 
 def single_threaded(function: Function) -> Function:
-    """Return a function that runs `function` within `one_thread`.
+    """Return a function that calls `function` while torch uses a single thread (`one_thread`).
 
-    A generator function runs within `one_thread` while it computes each item, and not between
-    items.
+    If `function` is a generator function, torch uses one thread while each item is computed, but
+    not between items.
     """
 
     @functools.wraps(function)

@@ -29,17 +29,17 @@ class CutNumbers:
     """Parameters of the cut of a mesh into convex parts."""
 
     thresholds: tuple[float, ...] = (0.05, 0.02, 0.01)
-    """Concavities of a part below which CoACD cuts no further (no unit). The first is taken at
-    which the parts do not bulge, or else the last.
+    """Concavities of a part (no unit), as CoACD defines them, below which it cuts no further. They
+    are tried in order, until the parts do not bulge out of the mesh.
     """
     bulge: float = 1e-3
     """Greatest distance [m] of the parts' surface outside the mesh. It is `TrialSpec.overlap`, the
     depth at which a hand may start in the parts.
     """
     within: float = 0.95
-    """Share of the parts' surface that must be within this distance."""
+    """Share of the parts' surface that must be within the distance `bulge` of the mesh."""
     sampled: int = 2000
-    """Points of this surface that are measured."""
+    """Number of points of the parts' surface whose distance is measured."""
 
 
 CUT = CutNumbers()
@@ -156,8 +156,8 @@ def read_solid(
 ) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
     """Read a closed mesh [m]; return it and its convex parts.
 
-    These are the given `parts`, or a convex decomposition if they are None. Raises `MeshError`
-    for given parts whose box is not that of the mesh.
+    These are the given `parts`, or a convex decomposition if they are None. Raises `MeshError` for
+    given parts whose bounding box differs by more than 10 mm from that of the mesh.
     """
     mesh = read_mesh(mesh)
     if parts is None:
@@ -175,7 +175,7 @@ def read_solid(
 def hull(corners: np.ndarray) -> "trimesh.Trimesh":
     """Return the convex hull of the points `corners` (n, 3) [m] as a mesh.
 
-    The points are rounded to `DECIMALS` if the mesh of the hull would not be closed.
+    The points are rounded to 1e-6 m if the mesh of the hull would otherwise not be closed.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         body = trimesh.convex.convex_hull(corners)
@@ -187,7 +187,7 @@ def hull(corners: np.ndarray) -> "trimesh.Trimesh":
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
     """Return the given convex parts [m] as a list.
 
-    Raises `MeshError` if one is not convex, or for none or too many parts.
+    Raises `MeshError` if one is not convex, and for no parts or more than 1000.
     """
     if len(parts) > MOST_PARTS:
         raise MeshError("parts", f"{len(parts)} parts", f"at most {MOST_PARTS}")

@@ -113,7 +113,7 @@ class MujocoScene(SimulatedScene):
     def keep(self) -> "Callable[[], MujocoScene]":
         """Return a function that opens scenes in the present state of this one.
 
-        They share its model.
+        The scenes share the MuJoCo model of this one.
         """
         kept = copy.copy(self.data)
 
@@ -136,20 +136,20 @@ class MujocoScene(SimulatedScene):
         self.data.xfrc_applied[self.body] = [*force, *torque]
 
     def displace(self, shift: np.ndarray) -> None:
-        """Move the object by a displacement `shift` (3,) [m]."""
+        """Move the object at once by a displacement `shift` (3,) [m] in the world's frame."""
         start = self.model.joint(OBJECT).qposadr[0]
         self.data.qpos[start : start + 3] += shift
         self._mujoco.mj_step1(self.model, self.data)
 
     def joints(self) -> np.ndarray:
-        """Return the positions (j,) [rad or m] of the driven joints."""
+        """Return the positions (j,) [rad or m] of the j driven joints."""
         return self.data.qpos[self._positions]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip with respect to the
-        driven joints.
+        """Return the Jacobian (f, 3, j) [m/rad] of one point on each of the f fingertips with
+        respect to the j driven joints.
 
-        The `points` (f, 3) [m] are in the world's frame.
+        Jacobian and `points` (f, 3) [m] are in the world's frame.
         """
         jacobian = np.zeros((len(self.tips), 3, self.model.nv))
         for rows, point, tip in zip(jacobian, points, self.tips, strict=True):
@@ -157,7 +157,9 @@ class MujocoScene(SimulatedScene):
         return jacobian[:, :, self._velocities]
 
     def penetration(self) -> float:
-        """Return the largest depth [m] by which the hand penetrates another body or itself."""
+        """Return the largest depth [m] by which the hand penetrates another body or itself; at most
+        0 if it penetrates nothing.
+        """
         deepest = 0.0
         found = self.data.contact
         for (first, second), distance in zip(found.geom, found.dist, strict=True):
@@ -211,7 +213,7 @@ def scene_mjcf(spec: SceneSpec) -> str:
 def render_mjcf(template: str, **values: Any) -> str:
     """Return a model in MJCF, as text, from a template of this folder filled with `values`.
 
-    Numbers keep their precision.
+    Numbers are written without loss of precision.
     """
     filters = {
         "numbers": format_numbers,
@@ -225,8 +227,8 @@ def render_mjcf(template: str, **values: Any) -> str:
 def nest_links(urdf: Urdf) -> list[tuple[Link, Joint | None, int]]:
     """Return (link, joint, ends) for all links from the root down, in the order of nested XML.
 
-    `joint` moves the link (None for the root); `ends` is the number of nested bodies that end with
-    it.
+    `joint` moves the link; it is None for the root. `ends` is the number of XML elements to close
+    after the link.
     """
     links = {link.name: link for link in urdf.links}
     waiting = [(0, urdf.root, None)]

@@ -44,13 +44,16 @@ class BodyNumbers:
     """Settings of PhysX for bodies."""
 
     contact_offset: float = 0.002
-    """Distance [m] at which contacts are made before shapes touch."""
+    """Distance [m] between two shapes below which PhysX creates their contacts, before they touch.
+    """
     iterations: int = 32
     """Iterations of the solver for positions in each step; with more, held objects creep less."""
     scale: float = 0.01
-    """Ratio of true to cooked lengths; PhysX drops vertices within 0.7 mm."""
+    """Ratio of true lengths to those of the shapes that PhysX prepares. It drops vertices within
+    0.7 mm of a hull.
+    """
     hull: int = 129
-    """Most vertices of a hull of which PhysX keeps all, as it keeps 255 faces."""
+    """Largest number of vertices of a hull of which PhysX keeps all: its limit is 255 faces."""
     foot: int = 100
     """Number of lowest vertices of a larger hull that make a shape of their own."""
 
@@ -61,8 +64,9 @@ BODIES = BodyNumbers()
 def open_world(gravity: float, timestep: float, patches: bool) -> tuple[Any, Any]:
     """Return an empty physics system and its scene.
 
-    `gravity` is in m/s^2, `timestep` in seconds. `patches` selects the solver TGS, which knows
-    contact patches.
+    `gravity` [m/s^2] is the size of the downward acceleration, and `timestep` is in seconds. If
+    `patches` is true, PhysX's solver TGS is selected, which simulates contact patches. Otherwise it
+    is PGS.
     """
     sapien, physx = import_sapien()
     physx.set_scene_config(
@@ -81,13 +85,15 @@ def open_world(gravity: float, timestep: float, patches: bool) -> tuple[Any, Any
 
 
 def surface_of(friction: float) -> Any:
-    """Return the material of a surface with a coefficient of `friction`, on which nothing bounces."""
+    """Return PhysX's material of a surface with a coefficient of `friction`, on which nothing
+    bounces.
+    """
     _, physx = import_sapien()
     return physx.PhysxMaterial(friction, friction, 0.0)
 
 
 def place(scene: Any, name: str, body: Any, height: float = 0.0) -> None:
-    """Add an entity with one body and a `name` to the scene.
+    """Add an entity called `name` with one body to a SAPIEN scene.
 
     The body's origin is at a `height` [m] on the world's z axis.
     """
@@ -100,10 +106,11 @@ def place(scene: Any, name: str, body: Any, height: float = 0.0) -> None:
 
 
 def table(material: Any, spec: SceneSpec) -> Any:
-    """Return the body of the table, of the given `material`; its origin is at its height.
+    """Return PhysX's body of the table, of the given `material`. The body's origin lies on the
+    table's surface.
 
-    It is a half space, or with an edge the surface of a box, in triangles. On a solid box a rocking
-    object would gain energy until it falls over.
+    Without an edge, it is a half space. With an edge (`spec.edge`), it is the surface of a box, in
+    triangles. On a solid box a rocking object would gain energy until it falls over.
     """
     sapien, physx = import_sapien()
     body = physx.PhysxRigidStaticComponent()
@@ -131,9 +138,10 @@ def table(material: Any, spec: SceneSpec) -> Any:
 def rigid_body(material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: float) -> Any:
     """Return a dynamic body of uniform density, made of convex hulls.
 
-    `spec` gives mass and inertia, `hulls` the vertices (v, 3) [m] of each hull, and `patch` [m] the
-    radius of contact patches. PhysX drops vertices within 0.7 mm of the hull of the others.
-    Therefore it gets hulls a hundred times as large.
+    `spec` gives mass and inertia, and `material` is PhysX's surface material. `hulls` are the
+    vertices (v, 3) [m] of each hull, and `patch` [m] is the radius of contact patches. PhysX drops
+    vertices within 0.7 mm of the hull of the others. Therefore it gets hulls a hundred times as
+    large.
     """
     sapien, physx = import_sapien()
     scale = BODIES.scale
@@ -159,8 +167,8 @@ def rigid_body(material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: fl
 def split_hull(hull: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the vertices (v, 3) [m] of a convex hull, and for a large hull those of its foot.
 
-    PhysX drops vertices of a hull with more than `BODIES.hull`. The foot of such a hull consists of
-    its `BODIES.foot` lowest vertices and the mean of all.
+    PhysX drops some vertices of a hull with more than 129 vertices (`BODIES.hull`). The foot of
+    such a hull consists of its 100 lowest vertices (`BODIES.foot`) and the mean of all.
     """
     yield hull
     if len(hull) > BODIES.hull:
@@ -168,7 +176,9 @@ def split_hull(hull: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
-    """Load the hand on its mount into a scene, and return it in its initial posture."""
+    """Load the hand on its mount into a SAPIEN scene. Return its articulation in the initial
+    posture.
+    """
     loader = scene.create_urdf_loader()
     loader.fix_root_link = True
     loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
@@ -203,10 +213,10 @@ def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
 
 
 def import_sapien() -> tuple[Any, Any]:
-    """Import and return SAPIEN and its physics module.
+    """Import SAPIEN, and return it and its physics module.
 
-    Its warning about missing Vulkan is hidden, because physics works without. Raises `MissingExtra`
-    if SAPIEN is not installed.
+    SAPIEN's warning about missing Vulkan is hidden, because physics works without Vulkan. Raises
+    `MissingExtra` if SAPIEN is not installed.
     """
     try:
         with warnings.catch_warnings():

@@ -82,8 +82,8 @@ class SapienScene(SimulatedScene):
     def keep(self) -> "Callable[[], SapienScene]":
         """Return a function that opens scenes in the present state of this one.
 
-        It repeats all calls in a fresh scene, because PhysX packs its bodies, but not the state of
-        its contacts.
+        The function repeats all calls of this scene in a fresh one. PhysX can store the state of
+        its bodies, but not that of its contacts.
         """
         calls = tuple(self._calls)
 
@@ -151,8 +151,8 @@ class SapienScene(SimulatedScene):
 
     @_noted
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force (3,) [N] and a torque (3,) [N m] to the object, in this and all later
-        steps.
+        """Apply a force (3,) [N] at the object's centre of mass and a torque (3,) [N m]. They are
+        in the world's axes, and act in this and all later steps.
         """
         self._force = np.asarray(force, np.float32)
         self._torque = np.asarray(torque, np.float32)
@@ -160,20 +160,20 @@ class SapienScene(SimulatedScene):
 
     @_noted
     def displace(self, shift: np.ndarray) -> None:
-        """Move the object by a displacement `shift` (3,) [m]."""
+        """Move the object at once by a displacement `shift` (3,) [m] in the world's frame."""
         sapien, _ = import_sapien()
         pose = self.body.entity_pose
         self.body.entity.set_pose(sapien.Pose(pose.p + shift, pose.q))
 
     def joints(self) -> np.ndarray:
-        """Return the positions (j,) [rad or m] of the driven joints."""
+        """Return the positions (j,) [rad or m] of the j driven joints."""
         return np.asarray(self.hand.get_qpos(), float)[self._places]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip with respect to the
-        driven joints.
+        """Return the Jacobian (f, 3, j) [m/rad] of one point on each of the f fingertips with
+        respect to the j driven joints.
 
-        The `points` (f, 3) [m] are in the world's frame.
+        Jacobian and `points` (f, 3) [m] are in the world's frame.
         """
         poses = [link.entity_pose.to_transformation_matrix() for link in self._children]
         frames = np.array(poses, float) @ self._frames
@@ -190,7 +190,8 @@ class SapienScene(SimulatedScene):
 
     @_noted
     def penetration(self) -> float:
-        """Return the largest depth [m] by which the hand penetrates a body or itself.
+        """Return the largest depth [m] by which the hand penetrates another body or itself; at most
+        0 if it penetrates nothing.
 
         It is measured after a step without gravity.
         """

@@ -38,11 +38,11 @@ class SimulationNumbers:
     near: float = 3e-4
     """Height [m] above the table below which a vertex is moved onto the table."""
     slack: float = 0.01
-    """Distance [m] by which the limits of the mount's joints exceed their motion."""
+    """Distance [m] by which the joint limits of the hand's mount exceed the planned motion."""
     lift_slack: float = 0.05
-    """Height [m] by which the limit of the lift exceeds its motion."""
+    """Height [m] by which the limit of the mount's lift exceeds the planned lift."""
     level: float = 1e-9
-    """Cosine of the pitch below which roll and yaw have the same axis."""
+    """Cosine of the pitch below which roll and yaw count as rotations about the same axis."""
     bits: int = 31
     """Number of bits of a collision mask: MuJoCo's masks are signed numbers of 32 bits."""
     reach: float = 1.0
@@ -116,7 +116,7 @@ class SceneSpec:
         drives: drive of every movable joint of the URDF, by name.
         tip_links: names of the links of the f fingertips, in the order of the grasp's contacts.
         mesh: closed mesh [m] of the object, which gives table height, centre of mass and inertia.
-        parts: convex bodies [m] that make up the object.
+        parts: convex parts [m] that make up the object.
         mass: mass [kg] of the object.
         friction: friction coefficient of every contact; `table_friction` may replace it.
         gravity: acceleration [m/s^2] by gravity, downward.
@@ -231,8 +231,8 @@ class SceneSpec:
 
         `centre` (3,) [m] is its centre in the world's frame, and `half` (3,) [m] half its lengths.
         The columns of `axes` (3, 3) are its axes: outward beyond the edge, along the edge, and up.
-        The box is under the object. It ends at the edge, or `SIMULATION.reach` [m] beyond the
-        object's middle if the edge is farther.
+        The box is under the object. It ends at the edge, or 1 m beyond the object's middle
+        (`SIMULATION.reach`) if the edge is farther.
         """
         assert self.edge is not None
         x, y, offset = self.edge
@@ -320,8 +320,9 @@ class Slide(NamedTuple):
 
 
 def edge_of(table: Plane) -> tuple[float, float, float] | None:
-    """Return the edge of a table that is level in the world's frame, as `SceneSpec` takes it; None
-    without one.
+    """Return the edge of a level table as (x, y, offset) in the world's frame; None without an
+    edge. (x, y) is a horizontal unit vector that points off the table, and `offset` [m] the edge's
+    position along it.
     """
     if table.edge is None:
         return None
@@ -370,13 +371,13 @@ def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
 
 
 def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[int, int]]:
-    """Return for each link in `pairs` two bit masks: its own collision group, and the groups that
-    it collides with.
+    """Return two bit masks for each link in `pairs`, by its name: its own collision group, and the
+    groups that it collides with.
 
     `pairs` are the names of links that are to collide; no other two of these links do. Two links
     collide if the group of one shares a bit with the mask of the other. PhysX and MuJoCo work so.
-    Only one link of each pair needs its own bit. Bits from number `first` (from 0) are used; those
-    below are taken. Raises `HandFileError` if they do not suffice.
+    Only one link of each pair needs its own bit. The bits from number `first` on are used; bit 0 is
+    the lowest. Raises `HandFileError` if 31 bits do not suffice (`SIMULATION.bits`).
     """
     left = [tuple(pair) for pair in pairs]
     kinds = dict.fromkeys((name for pair in left for name in pair), 0)

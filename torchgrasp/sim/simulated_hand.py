@@ -67,7 +67,8 @@ class SimulatedHand:
         force: true normal forces (f,) [N], averaged over the last tick.
         pushes: full forces (f, 3) [N] of the fingertips on the object, in the world's frame,
             averaged over the last tick.
-        finger: mask (f,) of the fingers that touched the object in the last timestep.
+        finger: mask (f,) of the fingers that touched the object in the last timestep. Contacts of
+            the fingertip and of the link that carries it count.
         steps: number of timesteps so far.
         sent: targets (j,) [rad or m] of the last tick, in the order of `scene.joint_names`.
         first_touch: number (f,) of the timestep of each fingertip's first contact with the object;

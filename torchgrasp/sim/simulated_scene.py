@@ -157,8 +157,8 @@ class SimulatedScene(abc.ABC):
     def keep(self) -> "Callable[[], SimulatedScene]":
         """Return a function that returns copies of this scene in its present state.
 
-        Each copy continues bitwise as this scene does. So several pulls can start from one closed
-        grasp.
+        Each copy continues with bitwise the same results as this scene. So several pulls can start
+        from one closed grasp.
         """
 
     @abc.abstractmethod
@@ -277,7 +277,7 @@ class SimulatedScene(abc.ABC):
         world's frame.
 
         They are in the order of `SceneSpec.neighbours`. A transform takes the points of a body's
-        mesh from the initial to the present place. So it is the identity at the start.
+        mesh from the initial to the present position. So it is the identity at the start.
         """
         return np.array([self._pose(body) for body in self.neighbours]).reshape(-1, 4, 4)
 
@@ -285,8 +285,8 @@ class SimulatedScene(abc.ABC):
         """Return the rigid transform (4, 4) [m] that has moved the object since the start, in the
         world's frame.
 
-        It takes the points of the object's mesh from the initial to the present place. So it is the
-        identity at the start.
+        It takes the points of the object's mesh from the initial to the present position. So it is
+        the identity at the start.
         """
         return self._pose(self.body)
 

@@ -15,9 +15,10 @@ from torchgrasp.shape.surface import collision_field, extract_mesh
 
 
 class EstimatedBody(NamedTuple):
-    """The planner's estimate of one object, or of the object of each entry of a batch of grasps.
+    """The planner's estimate of one object, or of one object for each entry of a batch of grasps.
 
-    For a batch, all fields hold one value for each entry. All is in an upright frame: z points up.
+    For a batch, all fields hold one value for each entry, along the leading axis `*b`. All vectors
+    are in an upright frame: z points up.
     """
 
     shape: ShapeGP | ShapeBatch  # the estimated shape
@@ -31,7 +32,7 @@ class EstimatedBody(NamedTuple):
 
     @classmethod
     def of(cls, shape: ShapeGP) -> "EstimatedBody":
-        """Return the body of a shape that is given in an upright frame."""
+        """Return the estimate of one object from its `shape`, which is in an upright frame."""
         mesh = extract_mesh(shape)
         return cls.around(shape, mesh.vertices, collision_field(shape, mesh))
 
@@ -39,8 +40,9 @@ class EstimatedBody(NamedTuple):
     def around(
         cls, shape: ShapeGP, vertices: Float[Tensor, "v 3"], field: DistanceField
     ) -> "EstimatedBody":
-        """Return the body of a shape, given the `vertices` [m] and the distance `field` of its
-        surface.
+        """Return the estimate of one object from its `shape`. `vertices` (v, 3) [m] are those of
+        its surface mesh, and `field` gives the distances from this surface. All are in an upright
+        frame.
         """
         center = vertices.mean(0)
         rise = vertices[:, 2].amax() - vertices[:, 2].amin()
@@ -48,7 +50,7 @@ class EstimatedBody(NamedTuple):
         return cls(shape, field, center, shape.scale, float(rise), float(deviations[1]))
 
     def rows(self, index: Int[Tensor, "k"]) -> "EstimatedBody":
-        """Return the bodies of the entries of the batch with the given indices.
+        """Return the estimates for the entries of the batch with the k indices `index`.
 
         If the body is one object for all entries, it is returned as it is.
         """

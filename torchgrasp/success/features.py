@@ -64,15 +64,17 @@ class FeatureNumbers:
     """Loads and bounds of forces in the features of the success model."""
 
     slippery: float = 0.5
-    """Share of the friction coefficient that a slippery object has."""
+    """Factor on the friction coefficient, for the features of a slippery object."""
     pull: float = 10.0
     """Acceleration [m/s2] of a pull."""
     least_force: float = 1e-3
-    """Least force [N] that counts: its logarithm is finite."""
+    """Lower bound [N] of forces, so that their logarithms are finite."""
     most_force: float = 1e3
-    """Greatest force [N] that counts; it also stands for a load that no force can carry."""
+    """Upper bound [N] of forces; it also stands for a load that no force can carry."""
     most_spare: float = 2.0
-    """Greatest absolute value of a force to spare, a logarithm, that counts in a mean."""
+    """Upper bound of the absolute value of a force to spare, in means. It is the logarithm of a
+    ratio of forces.
+    """
 
 
 MEASURES = FeatureNumbers()
@@ -92,14 +94,14 @@ def measure_grasps(
 ) -> Float[Tensor, "c g k"]:
     """Return the k features of each of g grasps for a task, for each of c conditions.
 
-    There is a column for each name in `FEATURES`.
+    The features are in the order of the tuple `FEATURES`.
 
-    `CAUSES` gives their units; shares and logarithms have none. Body and grasps are in an upright
-    frame; `body` is one object for all grasps, or one for each. `conditions` are the
-    frictions and masses, in place of the mass of the `task`. `lifted` says whether the task is a
-    lift; otherwise the object is pulled. A force to spare is the logarithm of the fingers' strength
-    over the force needed. "force needed", "force to spare" and the features named "slippery" are at
-    half the friction.
+    The dict `CAUSES` gives their units; shares and logarithms have none. Body and grasps are in an
+    upright frame; `body` is one object for all grasps, or one for each. `conditions` are c pairs of
+    a friction coefficient and a mass [kg]; they replace the mass of the `task`. `lifted` says
+    whether the task is a lift; otherwise the object is pulled. A force to spare is the logarithm of
+    a ratio: the fingers' strength divided by the force needed. "force needed", "force to spare" and
+    the features named "slippery" are at half the friction.
     """
     contacts = grasps.contacts
     g = len(grasps)
@@ -156,7 +158,8 @@ def weight_about(
     """Return the weight of a mass [kg] about the centroid of each contact set: force [N], then
     torque [N m].
 
-    The contacts (g, f, 3) [m] and the centre of mass are in an upright frame.
+    The contact `points` (g, f, 3) [m] and the centre of mass `center` [m] are in an upright frame.
+    The centre is one for all g contact sets, or one for each.
     """
     arm = center - points.mean(1)
     force = torch.zeros_like(arm)
@@ -172,15 +175,15 @@ def carries_weight(
     spec: ContactSpec,
     most: float,
 ) -> Bool[Tensor, "g"]:
-    """Return whether the fingers of each of g grasps can carry a weight.
+    """Return a mask of the g grasps whose fingers can carry the weight of a mass.
 
-    By linear programming: no contact force is outside its friction cone, and none is greater than
-    the drives allow. `UNCARRIED` says what it means for success.
+    They can if contact forces exist that balance the weight, within the friction cones. No force
+    may exceed `most`, or what the torques of the drives allow. It is found by linear programming.
 
     Args:
         hand: the hand of the grasps.
         grasps: the grasps, in an upright frame.
-        center: centre of mass [m]: one for all grasps, or one for each.
+        center: centre of mass (3,) [m] for all grasps, or one for each (g, 3).
         mass: the lifted mass [kg].
         spec: its `planned_friction` and `edges` define the friction cones.
         most: greatest normal force [N] of a finger in the task.

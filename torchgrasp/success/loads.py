@@ -26,13 +26,15 @@ class LoadNumbers:
     e.
     """
     torsion: float = 0.01
-    """Lever [m] of the torsion of a contact, which is added to the triangle's height."""
+    """Length [m] that is added to the height of the contacts' triangle, for the torsional friction
+    of a contact.
+    """
     edges: int = 32
     """Number of edges of the pyramid that approximates a friction cone."""
     least_force: float = 0.3
-    """Least force [N] that counts in the log-odds."""
+    """Lower bound [N] of forces in the log-odds."""
     most_force: float = 100.0
-    """Greatest force [N] that counts."""
+    """Upper bound [N] of forces in the log-odds."""
 
 
 LOADS = LoadNumbers()
@@ -43,9 +45,9 @@ def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> 
     [m].
 
     It is the distance of `center` from the longest side of the contacts' triangle. It is divided by
-    the triangle's height over this side plus `LOADS.torsion`. About this side the object turns most
-    easily. For more than three contacts, the triangle with the smallest result counts. `center` is
-    one point (3,), or one for each set (b, 3).
+    the triangle's height over this side, plus 10 mm (`LOADS.torsion`). About this side the object
+    turns most easily. For more than three contacts, the triangle with the smallest result counts.
+    `center` is one point (3,), or one for each of the b sets (b, 3). All points are in one frame.
     """
     if points.shape[1] > 3:
         triples = subsets(points.shape[1], 3, points.device)
@@ -74,9 +76,9 @@ def carrying_force(
 
     The result holds a factor (no unit) for each of m `frictions`, the friction coefficients, and b
     contact sets. `forces` f_0 [N] balance each other without a load. The `load` [N] acts at
-    `center` [m], one point or one for each set. A force of the size `push` [N] in any direction
-    acts there, too. All vectors are in the frame of the contacts. The wrench of load and push is w.
-    Equal springs share it, with the grasp map G:
+    `center` [m], one point (3,) or one for each set (b, 3). A force of the size `push` [N] in any
+    direction acts there, too. All vectors are in the frame of the contacts. The wrench of load and
+    push is w. Equal springs share it, with the grasp map G:
 
         f = s f_0 - G^+ w,    y . f >= 0 for all edges y of the cones dual to the friction cones.
 
@@ -104,10 +106,11 @@ def carrying_force(
 def greatest_force(
     hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> Float[Tensor, "g"]:
-    """Return the largest factor (no unit) on the `forces` [N] of each of g grasps. At it no drive
+    """Return the largest factor (no unit) on the `forces` [N] of each of g grasps at which no drive
     exceeds its greatest torque.
 
-    The forces at the contacts are in the frame of the grasps. Forces that are NaN give NaN.
+    The forces (g, f, 3) act at the f contacts of each grasp, in the frame of the grasps. Forces
+    that are NaN give NaN.
     """
     jacobian, pushes, effort = _levers(hand, grasps, grasps.contacts, forces)
     torque = torch.einsum("gfih,gfi->gh", jacobian, pushes)
@@ -120,8 +123,9 @@ def strength_of(
     """Return the greatest normal force [N] that each fingertip alone can press with, at most `most`
     [N].
 
-    The torques of the finger's drives bound it. `held` gives the posture of the hand, and contact i
-    of `contacts` is that of finger i. It is 0 at a contact that is NaN.
+    The torques of the finger's drives bound the force. `held` gives the postures of the hand in g
+    grasps. `contacts` are their contacts, one for each of the f fingers. The force is 0 at a
+    contact that is NaN.
     """
     jacobian, pushes, effort = _levers(hand, held, contacts, -contacts.normals)
     torque = torch.einsum("gfih,gfi->gfh", jacobian, pushes)
@@ -149,7 +153,8 @@ def log_odds_about(
 
     `centers` [m] are in the frame of the grasps; the first is the one for which `grasps.score` was
     predicted. Only the force that carries the load depends on the centre. `weight` (3,) is the load
-    [N] in this frame, and `friction` the coefficient of friction.
+    [N] in this frame, and `friction` the coefficient of friction. As in the features of the success
+    model, the load must be carried at half of this friction.
     """
     points = grasps.contacts.points.to(centers)
     normals = grasps.contacts.normals.to(centers)

@@ -32,7 +32,7 @@ class SuccessModel(Value):
     are fractions in [0, 1], have no unit.
     """
 
-    feature: Int[Tensor, "t m"]  # the feature that a node reads
+    feature: Int[Tensor, "t m"]  # index, from 0, of the feature that a node reads
     # a grasp goes to the first child where the feature is at most this
     threshold: Float[Tensor, "t m"]
     children: Int[Tensor, "t m 2"]  # indices of a node's two children; a leaf is its own child
@@ -40,13 +40,16 @@ class SuccessModel(Value):
     start: Float[Tensor, ""]  # log-odds without any tree
     range: Float[Tensor, "k 2"]  # least and greatest value of each feature in the trials
     usual: Float[Tensor, "k"]  # the median of each feature among grasps that held
-    # log-odds in ascending order, each with the least and greatest share of grasps that held there
+    # n ascending log-odds, each with the least and greatest share of such grasps that held in trials
     bands: Float[Tensor, "n 3"]
-    # of each trial of the best grasp for a task: log-odds, 1 if it held, the number of the family
+    # of r trials, each of the best grasp for a task: log-odds, 1 if it held (else 0), and the number
+    # of the family of bodies
     kept: Float[Tensor, "r 3"]
 
     def log_odds(self, features: Float[Tensor, "g k"]) -> Float[Tensor, "g"]:
-        """Return the log-odds of success of g grasps with the given `FEATURES`."""
+        """Return the log-odds (natural logarithm) of success of g grasps with k `features`, which
+        are in the order of `FEATURES`.
+        """
         node = torch.zeros(
             len(features), len(self.feature), dtype=torch.int64, device=features.device
         )
@@ -60,9 +63,10 @@ class SuccessModel(Value):
     def mean_log_odds(
         self, features: Float[Tensor, "c g k"], weights: Float[Tensor, "c"]
     ) -> Float[Tensor, "g"]:
-        """Return the log-odds of the mean success of g grasps under c conditions.
+        """Return the log-odds of the mean probability of success of g grasps under c conditions.
 
-        `weights` are the probabilities of the conditions.
+        A condition is a pair of a friction and a mass. `features` are those of each grasp under
+        each condition, and `weights` the probabilities of the conditions.
         """
         log_odds = self.log_odds(features.flatten(0, 1)).view(features.shape[:2])
         if len(log_odds) == 1:
@@ -84,8 +88,8 @@ class SuccessModel(Value):
             depth = depth + 1
 
     def interval(self, log_odds: Float[Tensor, "*g"]) -> Float[Tensor, "*g 2"]:
-        """Return the least and the greatest share of grasps with these log-odds that held in
-        trials.
+        """Return the least and the greatest share, in [0, 1], of grasps with these log-odds that
+        held in trials. The result has one pair for each of the `log_odds`, of any shape.
 
         Both are interpolated linearly between `bands`.
         """
@@ -98,5 +102,5 @@ class SuccessModel(Value):
 
 @functools.cache
 def load_success_model(device: torch.device | str = "cpu") -> SuccessModel:
-    """Return the shipped model of success in float64, on a device."""
+    """Return the model of success that torchgrasp ships, in float64 on a `device`."""
     return read_value(MODEL, KIND, SuccessModel)[0].to(device)

@@ -27,21 +27,24 @@ class MovedNumbers:
     count: int = 16
     """Number of displacements."""
     radius: float = 0.02
-    """The greatest displacement [m]: the fingers of a closing hand still reach the object."""
+    """The greatest displacement [m], at which the fingers of a closing hand still reach the object.
+    """
     turn: float = 0.618
-    """Step of the sequence of sizes, the golden ratio: the sizes fill the ball evenly."""
+    """Step (no unit) of the sequence from which the sizes of the displacements are taken: the
+    golden ratio. With it, the displacements fill a ball evenly.
+    """
     close: float = 3e-4
-    """Distance [m] from the surface that counts as a touch."""
+    """Distance [m] from the surface below which a fingertip counts as touching."""
     least: float = 2e-4
-    """Shortest step [m] of a fingertip."""
+    """Shortest step [m] of a fingertip in the search for its contact."""
     length: float = 0.12
-    """Longest way [m] of a fingertip."""
+    """Longest path [m] of a fingertip in the search for its contact."""
     steps: int = 24
-    """Largest number of steps."""
+    """Largest number of steps of this search."""
     still: float = 1e-6
     """Length [m] of a fingertip's path below which it has no direction."""
     flat: float = 1e-9
-    """Size of a distance's gradient (no unit) below which it has no direction."""
+    """Length of the gradient of the signed distance (no unit) below which it has no direction."""
 
 
 MOVED = MovedNumbers()
@@ -51,11 +54,13 @@ class MovedContacts(NamedTuple):
     """Contact sets of g grasps after each of d displacements of the object.
 
     Args:
-        contacts: contact points [m] and outward normals in the object's frame, f for each set. The
-            d g sets are ordered by displacement, then by grasp.
+        contacts: the d g contact sets: contact points [m] and outward normals in the object's
+            frame, one for each of the f fingertips. The sets are ordered by displacement, then by
+            grasp.
         forces: balanced contact forces [N] of these sets, of which the largest normal force is 1 N;
-            NaN if there are none.
-        touched: whether all fingers touch the object, and can press it with balanced forces.
+            NaN if there are none. They are in the order and frame of `contacts`.
+        touched: whether all f fingers of a grasp touch the displaced object, and can press on it
+            with balanced forces.
     """
 
     contacts: Contacts
@@ -66,12 +71,13 @@ class MovedContacts(NamedTuple):
 def touch_moved(
     hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> MovedContacts:
-    """Return the contacts of g grasps after each of `MOVED.count` displacements of the object.
+    """Return the contacts of g grasps after each of 16 displacements of the object (`MOVED.count`).
 
-    The displacements, at most `MOVED.radius`, fill a ball evenly, in the axes of the hand. The
-    contacts are in the frame of the object, as `field`. Each fingertip moves along the line from
-    its pre-grasp to its planned pose. It goes further, until it touches the surface that `field`
-    gives. The balanced `forces` [N] at the planned contacts say in which ratios the fingers push.
+    The displacements are at most 20 mm long (`MOVED.radius`). They fill a ball evenly, in the axes
+    of the hand. The contacts are in the frame of the object, as `field`. Each fingertip moves along
+    the straight line from its position in the pre-grasp to that in the grasp. It goes on beyond,
+    until it touches the surface that `field` gives. The balanced `forces` (g, f, 3) [N] at the f
+    planned contacts of each grasp say in which ratios the fingers push.
     """
     count = MOVED.count
     numbers = torch.arange(count, dtype=torch.float64, device="cpu")
@@ -101,10 +107,10 @@ def trace(
 
     The balls belong to d displacements, g grasps and f fingertips. All tensors but `radius` have
     the shape (d, g, f, 3), and the mask (d, g, f). Ball f, of a `radius` [m], starts with its
-    centre at `start` [m]. It moves along the unit vector `way`, at most `MOVED.length`. `field`
-    gives the signed distance [m] from the surface; the normals are outward unit vectors. A ball
-    that does not touch has the surface point nearest to its end. This is sphere tracing: a ball
-    moves on by its distance from the surface.
+    centre at `start` [m]. It moves along the unit vector `way`, by at most 120 mm (`MOVED.length`).
+    `field` gives the signed distance [m] from the surface; the normals are outward unit vectors. A
+    ball that does not touch has the surface point nearest to its end. This is sphere tracing: a
+    ball moves on by its distance from the surface.
     """
     travelled = torch.zeros_like(start[..., 0]).flatten(0, 1)
     shape = start.shape[:-1]

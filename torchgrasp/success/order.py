@@ -31,8 +31,8 @@ More would break the promise that 0.9 of the grasps hold.
 def is_covered(features: Float[Tensor, "g k"], names: Sequence[str] = DOMAIN) -> Bool[Tensor, "g"]:
     """Return a mask of the g grasps for which trials support the prediction of success.
 
-    `features` has a column for each name in `FEATURES`. The features in `names` must lie within the
-    range of the trials.
+    `features` (g, k) are those of the success model, in the order of the tuple `FEATURES`. Trials
+    support a prediction if the features called `names` lie within the range of the trials.
     """
     rows = [FEATURES.index(name) for name in names]
     least, most = load_success_model(features.device).range[rows].T
@@ -41,16 +41,21 @@ def is_covered(features: Float[Tensor, "g k"], names: Sequence[str] = DOMAIN) ->
 
 
 def covered_share(features: Float[Tensor, "c g k"], conditions: Conditions) -> Float[Tensor, "g"]:
-    """Return for each of g grasps the probability of a friction and a mass that trials support.
+    """Return for each of g grasps the probability that friction and mass lie within the range of
+    the model's trials.
 
-    It is 0 if another of the `features` in `DOMAIN` lies outside of the range of the trials.
+    It is 0 if another feature lies outside of this range: the surface's deviation, size or height
+    of the object, or force. `features` hold k features of g grasps for each of c pairs of a
+    friction and a mass (`conditions`).
     """
     others = [name for name in DOMAIN if name not in ("friction", "mass")]
     return supported_share(conditions) * is_covered(features[0], others).to(features)
 
 
 def supported_share(conditions: Conditions) -> float:
-    """Return the probability of a friction and a mass that trials support."""
+    """Return the probability that friction and mass, distributed as in `conditions`, lie within the
+    range of the model's trials.
+    """
     share = 1.0
     for name, law in (("friction", conditions.friction), ("mass", conditions.mass)):
         least, most = load_success_model().range[FEATURES.index(name)].tolist()
@@ -59,7 +64,8 @@ def supported_share(conditions: Conditions) -> float:
 
 
 def largest_known() -> float:
-    """Return the largest half size [m] of objects for which success is predicted.
+    """Return the largest half size [m] of the objects in the trials of the success model; for
+    larger ones, success is unknown.
 
     The half size is the length of a normalised unit of the estimated shape.
     """
@@ -67,11 +73,13 @@ def largest_known() -> float:
 
 
 def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], covered: Float[Tensor, "k"]) -> Grasps:
-    """Return grasps whose k executable ones have a new score, interval and `known`.
+    """Return the grasps, in which the k executable ones get new values of `score`, `interval` and
+    `known`.
 
-    The score is `log_odds`. `covered` is the probability of conditions that trials support. Of the
-    rest nothing is known. So the interval is that of the success model times `covered`, and its
-    upper end is greater by the rest. A grasp is known if the rest is at most `UNKNOWN`; otherwise
+    The score is `log_odds`, the predicted log-odds of success. `covered` is the probability that
+    friction and mass are within the range of the model's trials. Of the rest, 1 - `covered`,
+    nothing is known. So the interval is that of the success model times `covered`, and its upper
+    end is greater by the rest. A grasp is known if the rest is at most 0.1 (`UNKNOWN`); otherwise
     its interval is [0, 1]. Failed grasps keep their score; their interval is [0, 0], and they count
     as known.
     """
@@ -91,7 +99,7 @@ def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], covered: Float[Tensor, "
 
 
 def keep_promise(grasps: Grasps, share: float) -> Grasps:
-    """Return the grasps, in which executable ones that are not reliable enough get the status
+    """Return the grasps, in which executable ones with too low a predicted success get the status
     `NO_PROMISE`.
 
     `share`, in [0, 1], is the promised share of the remaining executable grasps that hold.
@@ -109,13 +117,14 @@ def keep_promise(grasps: Grasps, share: float) -> Grasps:
 
 
 def by_success(grasps: Grasps, *groups: Int[Tensor, "g"]) -> Grasps:
-    """Return grasps sorted by the indices in `groups`, and within a group by their predicted
-    success.
+    """Return grasps sorted by the keys `groups`, the smallest first, and within a group by their
+    predicted success.
 
     Executable grasps with a known success come first, then other executable ones, then failed ones.
     Within each of these the score falls; between equal scores, the greater margin of the
     certificate comes first. With an arm, grasps of equal success in whole per cent are sorted
-    further. They are in falling order of the product of the numbers in `ease`.
+    further. They are in falling order of the product of the numbers in `grasps.ease`: easily
+    reached grasps come first.
     """
     late = 2 * (grasps.status != Status.OK).int()
     late = late if grasps.known is None else late + (~grasps.known & (late == 0)).int()

@@ -28,8 +28,8 @@ BOUNDS = 200  # bounds of the log-odds that are tried, at equal steps
 class Promise(NamedTuple):
     """A promise, supported by trials, of the share of returned grasps that hold.
 
-    `least` is the least log-odds of a returned grasp. `trials` and `families` are the numbers of
-    trials, and of families of bodies in them, that chose it.
+    `least` is the least predicted log-odds of success of a returned grasp. `trials` and `families`
+    are the numbers of trials, and of families of bodies in them, that determined this bound.
     """
 
     least: float
@@ -39,8 +39,8 @@ class Promise(NamedTuple):
 
 @functools.cache
 def find_promise(share: float) -> Promise | None:
-    """Return the promise that a `share` of the returned grasps, in [0, 1], holds. Return None if
-    the trials support no bound.
+    """Return the promise that at least a `share` of the returned grasps, in [0, 1], holds. Return
+    None if the trials support no bound.
     """
     log_odds, held, family = load_success_model().kept.unbind(1)
     least = least_log_odds(log_odds, held > 0, family.long(), share)
@@ -63,11 +63,13 @@ def least_log_odds(
 ) -> float | None:
     """Return the least bound of the log-odds above which at least a `share` of the grasps holds.
 
-    None means that the trials support no bound. `share` is in [0, 1], and the module says how the
-    bound is chosen.
+    None means that the trials support no bound. `share` is in [0, 1]. The bound is chosen by
+    conformal risk control over families of bodies. It is the least b with sum_f l_f + `share` <= 0.
+    Here l_f is the mean of 1[log-odds >= b] (1[failed] - (1 - `share`)) over the trials of family
+    f.
 
-    Each of the r trials has predicted `log_odds`, and `held` (whether the grasp held). It has the
-    number of its `family` of bodies.
+    The r trials have the predicted `log_odds`. `held` says whether each grasp held, and `family`
+    holds the number of its family of bodies.
     """
     if not len(log_odds):
         return None

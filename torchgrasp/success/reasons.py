@@ -79,9 +79,9 @@ def explain_success(
 
     The log-odds of a probability p are log(p / (1 - p)). Each cause stands for several features,
     the inputs of the success model. Its `log_odds` is by how much the log-odds rise if these
-    features take their median over grasps that held. If no forces of the fingers carry the weight
-    of a lifted object, the `log_odds` of "load" are greater (`UNCARRIED`). Causes that do not lower
-    the success are left out.
+    features take their median over grasps that held. If no finger forces can carry the weight of a
+    lifted object, the `log_odds` of "load" are greater by 2.1 (`UNCARRIED`). Causes that do not
+    lower the success are left out.
 
     If no trial has tested some of the task's frictions and masses, "task" is always among the
     causes. Its sentence then says for what share of them the success is unknown.
@@ -142,17 +142,20 @@ def explain_success(
 
 
 def conditions_of(grasps: Grasps, task: GraspTask) -> Conditions:
-    """Return the frictions and masses of a task; the metadata of the grasps name the friction."""
+    """Return the frictions and masses for which the success in a task is predicted. The masses are
+    those of the `task`; the friction is that in the metadata of the grasps.
+    """
     return Conditions.of(Distribution.parse(grasps.meta["friction"]), task.mass)
 
 
 def measure_again(
     hand: Hand, body: EstimatedBody, grasps: Grasps, task: GraspTask
 ) -> Float[Tensor, "c g k"]:
-    """Return the `FEATURES` of g planned grasps for any task, under its c conditions.
+    """Return the k features of g planned grasps for any task, under each of its c conditions.
 
-    The first three arguments are those that `stand_upright` returns. The metadata of the grasps
-    name the table and the friction.
+    A condition is a pair of a friction and a mass. The features are in the order of the tuple
+    `FEATURES`. The first three arguments are what `stand_upright` returns: body and grasps in an
+    upright frame. The metadata of the grasps name the table and the friction.
     """
     conditions = conditions_of(grasps, task)
     return measure_grasps(hand, body, grasps, conditions, task, task.lifts(grasps.table))
@@ -172,8 +175,8 @@ def _is_carried(hand: Hand, body: EstimatedBody, grasp: Grasps, task: GraspTask)
 
 
 def stand_upright(grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[Hand, EstimatedBody, Grasps]:
-    """Return the hand on the device of the grasps, and the object and the grasps in an upright
-    frame.
+    """Return the hand on the device of the grasps. Then return object and grasps in an upright
+    frame, with z up.
 
     The `shape` is in the frame of the grasps.
     """

@@ -118,8 +118,8 @@ class ConditionNumbers:
     """Numbers of frictions and masses that stand for their distributions."""
 
     one: int = 9
-    """Number of frictions, or of masses if the friction is certain. Success falls by steps, of
-    which a mean over 9 misses at most 1/18.
+    """Number of frictions, or of masses if the friction is certain. Where success falls from 1 to 0
+    in a step, a mean over 9 is off by at most 1/18.
     """
     both: int = 3
     """Number of masses if the friction is uncertain, too: the load matters less."""
@@ -132,7 +132,7 @@ CONDITIONS = ConditionNumbers()
 class Conditions:
     """The c pairs of a friction and a mass [kg] for which success is predicted.
 
-    The two are independent. Each of n frictions stands beside all m masses.
+    The two are independent. Each of n frictions is paired with each of m masses, so that c = n m.
     """
 
     friction: Distribution
@@ -140,23 +140,25 @@ class Conditions:
 
     @classmethod
     def of(cls, friction: float | Distribution, mass: float | Distribution) -> "Conditions":
-        """Return the conditions of a coefficient of friction and a mass [kg]."""
+        """Return the conditions for a coefficient of friction and a mass [kg], each a number or a
+        `Distribution`.
+        """
         return cls(Distribution.of(friction), Distribution.of(mass))
 
     @functools.cached_property
     def frictions(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """The frictions, and their probabilities."""
+        """The n coefficients of friction, and their probabilities."""
         return self.friction.nodes(CONDITIONS.one)
 
     @functools.cached_property
     def masses(self) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
-        """The masses [kg], and their probabilities."""
+        """The m masses [kg], and their probabilities."""
         certain = len(self.frictions[0]) == 1
         return self.mass.nodes(CONDITIONS.one if certain else CONDITIONS.both)
 
     @property
     def weights(self) -> Float[Tensor, "c"]:
-        """The probability of each pair."""
+        """The probability (c,) of each pair of a friction and a mass. The mass changes fastest."""
         return torch.outer(self.frictions[1], self.masses[1]).flatten()
 
 
@@ -203,7 +205,9 @@ class TaskNumbers:
     convex hull contains the unit ball.
     """
     upward: float = 1.2
-    """Vectors among these with at least this z point straight up; "pour" leaves them out."""
+    """Vectors among these with at least this z component count as straight up; "pour" leaves them
+    out.
+    """
 
 
 TASKS = TaskNumbers()

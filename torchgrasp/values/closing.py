@@ -84,7 +84,7 @@ class Disturbance(Value):
         early: mask (3,) of the kinds whose first contact was before a fingertip touched the object.
         neighbour_pose: rigid transforms (t, m, 4, 4) [m] of m neighbours at t control ticks. They
             are in the frame of the planned cloud. Each moves a neighbour from its start to its
-            place at the tick.
+            position at the tick.
     """
 
     first_touch: Annotated[Float[Tensor, "3"], ANY]
@@ -142,8 +142,8 @@ class ClosureResult(Value):
         status: `OK`, or the reason why the object was not held.
         time: times (t,) [s] at which the control ticks ended, from the start of the simulation.
         forces: normal force (t, f) [N] of each fingertip; 0 without contact.
-        object_pose: transform (t, 4, 4) in the frame of the grasp. It moves the mesh that
-            `close_hand` was given to the object's place at the tick.
+        object_pose: transform (t, 4, 4) in the frame of the grasp. It moves the mesh, the argument
+            of `close_hand`, to the object's pose at the tick.
         hand_pose: pose (t, 4, 4) of the hand's root link in the frame of the grasp.
         joints: positions (t, j) [rad or m] of all joints, in the order of `joint_names`.
         targets: positions (t, j) [rad or m] that were the targets of the drives in the tick.
@@ -157,8 +157,8 @@ class ClosureResult(Value):
             the pressing.
         rise: height [m] by which the object's centre is higher at the end of the trial than at its
             start.
-        unbalanced: norm of the sum of the fingertip forces before the lift, over the sum of their
-            norms (no unit).
+        unbalanced: norm of the sum of the fingertip forces before the lift, divided by the sum of
+            their norms (no unit).
         slip: motion of the object relative to the hand, from the end of the pressing to the end of
             the trial.
         start_overlap: depth [m] by which the opened hand penetrates the object or the table at the
@@ -258,7 +258,8 @@ def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptio
     """Return the options of the closing mode `closing`.
 
     In the modes "uncertainty" and "fixed" these are the given `options`, or `ClosingOptions()` for
-    None. In other modes they are `NO_OPTIONS`; given options raise `BadArgument`.
+    None. In other modes all options are off (`NO_OPTIONS`). Raises `BadArgument` for other modes if
+    `options` is not None.
     """
     if closing in ("uncertainty", "fixed"):
         return ClosingOptions() if options is None else options

@@ -320,9 +320,9 @@ class IKSeeds(Batch):
     Attributes:
         joints: actuated joints (g, h) [rad or m], in the order of `hand.joint_names`.
         obj_from_hand: pose (g, 4, 4) [m] of the hand's root link in the frame of the contacts.
-        row: index (g,) of the contact set of each guess.
-        permutation: indices (g, f): in guess k finger i is placed on contact `permutation[k, i]` of
-            its set.
+        row: index (g,), in the batch of contact sets, of the set of each guess.
+        permutation: indices (g, f) of contacts: in guess k finger i is placed on contact
+            `permutation[k, i]` of the guess's set.
         energy: misfit (g,) of the posture, without unit; less is better. For `nearest_postures` it
             is half the squared distance between the features of posture and contacts
             (`PostureLibrary.feature`). For a learned model it is the least f_i of Eq. (21).
@@ -399,8 +399,9 @@ class Grasps(Batch):
             no bounds.
         arm: joints (g, n) [rad or m] of the arm at the grasp; None without an arm.
         ease: two numbers (g, 2) for the arm's straight path to the grasp. Column 0 is the least
-            distance of a joint from its limits, over half its range (no unit). Column 1 is the
-            least manipulability, sqrt(det(J J^T)) [m^3]. 0 for failed grasps; None without an arm.
+            distance of a joint from its limits, divided by half its range (no unit). Column 1 is
+            the least manipulability, sqrt(det(J J^T)) [m^3]. 0 for failed grasps; None without an
+            arm.
 
     Each index keeps the batch axis: `grasps[0]` is a batch of one, and `grasps[0].joints[0]` are
     its joints. For all joints of the hand see `Hand.expand`, for a 3D page

@@ -51,8 +51,8 @@ class ContactSpec(Value):
         edges: number of edges of the linearised friction cone, at least 3.
         max_variance: largest variance of the signed distance at a contact, S_thresh of Eq. (12), in
             squared normalised units.
-        friction_margin: share of the mean friction that is planned with. Contacts are planned, and
-            checked for force closure, with `planned_friction`. This is mean friction times
+        friction_margin: factor, 0.001 to 1, on the mean friction in planning. Contacts are planned,
+            and checked for force closure, with `planned_friction`. This is mean friction times
             `friction_margin`.
         separation: least distance [m] between the centres of two fingertips. None means
             26 mm (`SEPARATION`), or more for wide fingertips (`least_separation`). Contacts on
@@ -451,7 +451,7 @@ def default_holding(sensor: SensorModel, closing: ClosingMode) -> HoldingMode:
     """Return the default holding mode, "grip" or "force", for the sensors and a closing mode.
 
     It is "grip" if the `sensor` is tactile at all fingers and none is dead. The closing must also
-    be "uncertainty" or "fixed".
+    be "uncertainty" or "fixed". In all other cases it is "force".
     """
     return "grip" if sensor.full and closing in ("fixed", "uncertainty") else "force"
 

@@ -37,14 +37,14 @@ GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the 
 
 @dataclasses.dataclass(frozen=True)
 class PositionNumbers:
-    """Parameters of `PositionClosing`; the paper prints no gains."""
+    """Parameters of `PositionClosing`, a baseline whose gains the paper does not print."""
 
     depth: float = 0.02
-    """Distance [m] of the goal behind the planned contact."""
+    """Distance [m] of a fingertip's goal behind the planned contact, inside the object."""
     arrived: float = 1e-3
     """Distance [m] from the goal at which a finger stops."""
     integral: float = 2.0
-    """Integral gain [1/s^2]."""
+    """Integral gain [1/s^2] on the position error."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,11 +52,11 @@ class UnstableNumbers:
     """Parameters of the response of `Impedance` to an unstable grasp."""
 
     odds: float = 3.0
-    """Odds of stability above which a grasp counts as stable."""
+    """Odds p / (1 - p) of stability above which a grasp counts as stable."""
     cutoff: float = 2.0
     """Cut-off frequency [Hz] of the low-pass filter of the readings that are judged."""
     wait: float = 0.3
-    """Time [s] after the forces have risen, in which the filtered readings follow them."""
+    """Delay [s] from the end of the forces' rise until the low-passed readings are judged."""
     raised: float = 2.0
     """Factor to which the forces are raised."""
     rate: float = 8.0
@@ -77,7 +77,7 @@ class PaperClosing:
     `ClosingReference.as_printed`. A damped inverse replaces J^-1; speed is bounded. No joint target
     is so far ahead of its joint that the drive would exceed its torque limit. The closing ends when
     all fingers touch, and two conditions hold. The share of force control (lambda, Eq. 26) is at
-    least 0.5 in each finger. The forces have been steady for `SETTLED` seconds.
+    least 0.5 in each finger. The forces have been steady for 0.1 s (`SETTLED`).
     """
 
     palm = STILL
@@ -117,8 +117,8 @@ class PaperClosing:
 
 
 class PositionClosing:
-    """The paper's baseline (Table 7): a PI position controller for each fingertip, stopped at
-    `STOP_FORCE`.
+    """The paper's baseline (Table 7): a PI position controller for each fingertip. It stops a
+    finger at a force of 0.5 N (`STOP_FORCE`).
 
     The goal is `depth` [m] behind the planned contact, inside the object. With the paper's depth of
     0 a finger may stop before it touches.
@@ -172,8 +172,9 @@ class OpenLoopClosing:
     def advance(self, period: float) -> Float[Tensor, "*n j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later.
 
-        They are (j,) for one hand. They are (n, j) if the attribute `poses` holds the postures (3,
-        n, j) [rad] of n hands: pre-grasp, grasp and squeeze.
+        j counts all joints of the URDF. The targets are (j,) for one hand. They are (n, j) if the
+        attribute `poses` holds the postures (3, n, j) [rad] of n hands: pre-grasp, grasp and
+        squeeze.
         """
         self.time += period
         progress = min(self.time / POSE_TIME, 2.0)
@@ -188,9 +189,10 @@ def restoring_wrench(
     """Return the force [N] and torque [N m] of a spring that pulls the fingertips' frame back to
     its `rest` pose.
 
-    Both are in the hand's frame, as the two poses [m]. `hand_from_vf` is the virtual frame of three
-    fingertips, with its origin at their centroid (Eq. 18 of the paper). The torque is about that
-    centroid, and grows with the sine of the rotation error.
+    `hand_from_vf` [m] is the pose of the virtual frame of three fingertips. This frame has its
+    origin at their centroid (Eq. 18 of the paper). Poses, force and torque are in the hand's frame.
+    `*b` stands for any leading axes. The torque is about that centroid, and grows with the sine of
+    the rotation error.
     """
     axes = hand_from_vf[..., :3, :3].mT
     desired = rest[..., :3, :3].mT
@@ -205,8 +207,9 @@ def shared_forces(
     """Return the smallest fingertip forces [N] that exert a `wrench` [N, N m] about the centroid of
     the `points` [m].
 
-    Points, forces and wrench are in one frame. All forces are scaled down by one factor if one
-    would exceed `most` [N].
+    `points` are the contact points of three fingertips. Points, forces and wrench are in one frame.
+    `*b` stands for any leading axes. All forces are scaled down by one factor if one would exceed
+    `most` [N].
     """
     shared = matvec(torch.linalg.pinv(grasp_map(points)), wrench)
     forces = shared.unflatten(-1, (3, 3))
@@ -224,15 +227,15 @@ def spring_forces(
 
     The forces are in the frame of `points` [m], the centres of the fingertips. `lengths` [m] are
     the rest lengths of the sides (0, 1), (1, 2) and (2, 0), and `stiffness` [N/m] is that of each
-    spring.
+    spring. `*b` stands for any leading axes.
     """
     tension = stiffness * (side_lengths(points) - lengths)
     return torch.einsum("...k,...kci->...ci", tension, internal_forces(points))
 
 
 def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the lengths [m] of the sides (0, 1), (1, 2) and (2, 0) of the triangle of `points`
-    [m].
+    """Return the lengths [m] of the sides (0, 1), (1, 2) and (2, 0) of the triangle of three
+    `points` [m].
     """
     return norm(points.roll(-1, dims=-2) - points)
 
@@ -247,9 +250,9 @@ class Impedance:
     Args:
         reference: the closing plan.
         observation: the observation at the end of the closing.
-        start: targets [rad] of all joints at the end of the closing.
+        start: targets (j,) [rad] of all joints of the URDF at the end of the closing.
         springs: stiffness [N/m] of the springs along the sides of the triangle of fingertips; None
-            means `GRASP_STIFFNESS`.
+            means 100 N/m (`GRASP_STIFFNESS`).
         stability: model that judges the grasp; if it is unstable, forces and stiffness are raised
             and stay so. None means no judgement.
     """

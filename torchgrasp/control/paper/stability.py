@@ -46,8 +46,8 @@ PARTS = [
 def state_of(
     springs: Float[Tensor, "*b 3"], lengths: Float[Tensor, "*b 3"], forces: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 9"]:
-    """Return the state of a grasp: the logarithms of three stiffnesses, three distances and three
-    forces.
+    """Return the state of a grasp: the natural logarithms of three stiffnesses, three distances and
+    three forces.
 
     `springs` [N/m] are the stiffnesses of the virtual springs. `lengths` [m] are the distances of
     the fingertips from their centroid, and `forces` [N] their normal forces. All are in the order
@@ -90,8 +90,8 @@ class StabilityModel(Value):
     def preferred_forces(
         self, tips: Float[Tensor, "3 3"], force: Positive | None = None
     ) -> PreferredForces:
-        """Return the typical forces and stiffness of stable grasps whose fingertips are as far
-        apart as the `tips` [m].
+        """Return the typical forces [N] and stiffnesses [N/m] of stable grasps with fingertip
+        centres `tips` [m]. Only the distances of the tips from their centroid count.
 
         `force` [N] is the normal force of the finger that presses hardest; None means that the
         model chooses it.
@@ -117,8 +117,8 @@ class StabilityModel(Value):
 
     @checked(gradients=True)
     def log_odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
-        """Return the log-odds that a grasp with the `state` of `state_of` is stable, by Bayes' rule
-        on stiffness and forces.
+        """Return the natural log-odds that a grasp with the `state` is stable, by Bayes' rule on
+        stiffness and forces. `state` holds nine logarithms (`state_of`).
         """
         stable, others = self._without_lengths
         judged = torch.cat([state[..., :3], state[..., 6:]], -1)  # (*b, 6)
@@ -144,8 +144,8 @@ class StabilityModel(Value):
 
 @checked
 def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel | None:
-    """Return the stability model of a hand, read from `path`; None means `FILE` in the hand's
-    folder.
+    """Return the stability model of a hand, read from `path`; None means stability.safetensors in
+    the hand's folder.
 
     Return None if `path` is None and the hand's folder has no such file. Raises `ModelFileError`
     for a malformed file.
