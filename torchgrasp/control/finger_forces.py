@@ -161,7 +161,7 @@ def check_same_hand(hand: Hand, grasps: Grasps) -> None:
     names = grasps.meta.get("finger_names", ",".join(hand.finger_names)).split(",")
     count = grasps.contacts.fingertips
     if tuple(names) != hand.finger_names or count != len(names):
-        found = f"{count} contacts a row, of the fingers {', '.join(names)}"
+        found = f"{count} contacts in each grasp, of the fingers {', '.join(names)}"
         ours = ", ".join(hand.finger_names)
         advice = "`hand_of(grasps)` loads the fingers of grasps"
         raise BadArgument("grasps", found, f"those of the hand: {ours}; {advice}")

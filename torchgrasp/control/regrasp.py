@@ -62,7 +62,7 @@ def next_grasp(
     """
     others = list_others(grasps, tried)
     if not len(others):
-        raise BadArgument("tried", list(tried), "rows that leave another grasp to try")
+        raise BadArgument("tried", list(tried), "fewer grasps, so that another one is left to try")
     if surface is None or grasps.table is None or grasps.meta.get("ranking") != "success":
         return int(others[0])
     return int(others[_chances(grasps, grasps.table, surface, tried)[others].argmax()])

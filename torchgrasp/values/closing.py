@@ -265,7 +265,7 @@ def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptio
         return ClosingOptions() if options is None else options
     if options is not None:
         raise BadArgument(
-            "options", f"components for {closing!r}", "None, or closing 'uncertainty' or 'fixed'"
+            "options", f"options for {closing!r}", "None, or closing 'uncertainty' or 'fixed'"
         )
     return NO_OPTIONS
 
