@@ -4,10 +4,12 @@ import functools
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from tests.make import box, see
 from torchgrasp import Scene, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.cloud.safe_files import read_image_file
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.scene.masks import read_labels, read_mask
 
@@ -49,6 +51,8 @@ COLOURS = np.array([[0, 0, 0], [0, 9, 7], [200, 0, 0]], dtype=np.uint8)[LABELS]
     [
         *(LABELS.astype(kind) for kind in (np.uint8, np.uint16, np.int32, np.uint32, np.float32)),
         torch.from_numpy(LABELS)[..., None],
+        torch.from_numpy(LABELS)[None],
+        LABELS[None, None],
         COLOURS,
         np.concatenate([COLOURS, np.full((*SHAPE, 1), 255, dtype=np.uint8)], -1),
         masks(),
@@ -58,7 +62,7 @@ COLOURS = np.array([[0, 0, 0], [0, 9, 7], [200, 0, 0]], dtype=np.uint8)[LABELS]
         [{"size": list(SHAPE), "counts": as_text(run_lengths(mask)).encode()} for mask in masks()],
         {
             "annotations": [
-                {"segmentation": {"size": list(SHAPE), "counts": run_lengths(mask)}}
+                {"image_id": 7, "segmentation": {"size": list(SHAPE), "counts": run_lengths(mask)}}
                 for mask in masks()
             ]
         },
@@ -141,6 +145,36 @@ def test_a_mask_of_object_and_table_is_trimmed_with_a_note():
         assert 0.8 < removed / int((drawn & (labels == 0)).sum()) < 1.2 and removed < seen
         own = scene.pixels[scene.rows_of(target)]
         assert float((labels[own[:, 0], own[:, 1]] == 2).double().mean()) > 0.98
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"annotations": [{"image_id": k, "segmentation": masks()[k]} for k in range(2)]},
+            "annotations of the images 0, 1",
+        ),
+        (np.stack([100 * LABELS, 50 * LABELS, 0 * LABELS]), "mask 1 with numbers from 100 to 200"),
+        ([LABELS], "mask 1 with numbers from 1 to 2"),
+        ([255 * (LABELS == 1) + 3 * (LABELS == 2), LABELS == 2], "from 3 to 255.*mask > 127"),
+    ],
+)
+def test_masks_that_would_be_joined_are_refused(given, message):
+    with pytest.raises(BadArgument, match=message):
+        read_labels(given, SHAPE)
+
+
+@pytest.mark.parametrize(("first", "told"), [(0, False), (255, True)])
+def test_a_palette_whose_black_is_not_number_0_is_refused(tmp_path, first, told):
+    """Programs that reduce colours put white first: its number 0 would be no object."""
+    picture = Image.fromarray((LABELS == 1).astype(np.uint8), "P")
+    picture.putpalette([first] * 3 + [255 - first] * 3)
+    picture.save(tmp_path / "mask.png")
+    if told:
+        with pytest.raises(BadArgument, match="black has number 1; save it as RGB"):
+            read_image_file("mask", tmp_path / "mask.png")
+    else:
+        assert (read_image_file("mask", tmp_path / "mask.png") == (LABELS == 1)).all()
 
 
 def test_a_photograph_is_no_mask():

@@ -171,7 +171,21 @@ def _parse_picture(data: bytes, colours: bool) -> np.ndarray:
         allowed = GREY + COLOURS if colours else GREY
         if image.mode not in allowed:
             raise Malformed(f"a picture of mode {image.mode}")
-        return np.asarray(image)
+        pixels = np.asarray(image)
+        if image.mode == "P":
+            _check_palette(pixels, image.getpalette() or [])
+        return pixels
+
+
+def _check_palette(pixels: np.ndarray, palette: list[int]) -> None:
+    """Raise `Malformed` for a picture whose colour 0 is not black, though it has black pixels.
+
+    Programs that save few colours order them as they like: there 0 is no background.
+    """
+    colours = np.array(palette).reshape(-1, 3)
+    black = [k for k in np.unique(pixels).tolist() if k < len(colours) and not colours[k].any()]
+    if black and bool(colours[0].any()):
+        raise Malformed(f"a palette where black has number {black[0]}; save it as RGB")
 
 
 def _read_exr(path: Path) -> np.ndarray:

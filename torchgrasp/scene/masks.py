@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage
+from torchgrasp.foundation.limits import SHOWN_LETTERS
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane
 from torchgrasp.scene.image import IMAGE, DepthImage
@@ -26,6 +27,8 @@ class MaskNumbers:
 
     most_labels: int = 1000
     """Most objects; an image of labels with more values is taken for a photograph, and refused."""
+    shown: int = 3
+    """Most names of images that an error shows."""
     least_share: float = 0.05
     """A mask is refused if less than this share of its measured pixels is on objects above the
     table.
@@ -83,6 +86,7 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
     """
     if isinstance(labels, Mapping) and "annotations" in labels:
         labels = labels["annotations"]
+        _check_one_image(labels, name)
     masks = _masks(labels, shape)
     if masks is None:
         read = _read_one(labels, shape, name)
@@ -96,7 +100,12 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
     stack = torch.zeros(shape, dtype=torch.long)
     size = torch.zeros(shape, dtype=torch.long)
     for k, mask in enumerate(masks, start=1):
-        inside = _read_one(mask, shape, name) > 0
+        read = _read_one(mask, shape, name)
+        inside = read > 0
+        if len(values := read[inside].unique()) > 1:
+            found = f"mask {k} with numbers from {int(values.min())} to {int(values.max())}"
+            whole = "masks of one number beside 0, as mask > 127; labels (h, w); colours (h, w, 3)"
+            raise BadArgument(name, found, whole)
         own = int(inside.sum())
         above = inside & ((stack == 0) | (own <= size))
         stack[above] = k
@@ -107,15 +116,27 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
 def _masks(labels: Any, shape: tuple[int, ...]) -> Any:
     """Return several masks, given as a list or as an array (k, h, w) or (k, 1, h, w); None for
     anything else.
+
+    An array (1, h, w) may be an image of labels, and is no list.
     """
     if isinstance(labels, Tensor | np.ndarray):
         several = len(shape) == 2 and tuple(labels.shape[1:]) in (shape, (1, *shape))
-        return labels.reshape(-1, *shape) if several else None
+        return labels.reshape(-1, *shape) if several and len(labels) != 1 else None
     # of rows of different length, and of other types
     with contextlib.suppress(ValueError, TypeError, KeyError):
         if len(labels) and (isinstance(labels[0], Mapping) or np.ndim(labels[0]) >= 2):
             return labels
     return None
+
+
+def _check_one_image(annotations: Any, name: str) -> None:
+    """Raise `BadArgument` for COCO's annotations of several images: only one image is this one."""
+    if not isinstance(annotations, list | tuple):
+        return
+    images = {str(one.get("image_id")) for one in annotations if isinstance(one, Mapping)}
+    if len(images) > 1:
+        shown = ", ".join(sorted(images)[: MASKS.shown])[:SHOWN_LETTERS]
+        raise BadArgument(name, f"annotations of the images {shown}", "those of this image alone")
 
 
 def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..."]:
@@ -131,9 +152,10 @@ def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..
         exact = bool((numbers == read).all())
     except (TypeError, ValueError, OverflowError) as error:
         raise BadArgument(name, type(labels).__name__, whole) from error
-    if read.shape == (*shape, 1):
-        read = read[..., 0]
-        numbers = numbers[..., 0]
+    # one channel, before or after the image
+    if read.shape in ((*shape, 1), (1, *shape), (1, 1, *shape)):
+        read = read.reshape(shape)
+        numbers = numbers.reshape(shape)
     if len(shape) == 2 and read.shape in ((*shape, 3), (*shape, 4)) and exact:
         colour = numbers[..., :3] * (numbers[..., 3:] > 0) if read.shape[-1] == 4 else numbers
         return _dense(torch.from_numpy(np.abs(colour) @ COLOUR_PLACES))
