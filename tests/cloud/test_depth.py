@@ -289,6 +289,7 @@ def test_every_form_of_intrinsics_gives_the_same_cloud(name):
         (0.1, {"cam_K": K.ravel().tolist(), "depth_scale": 0.1}),
         (0.1, {"fx": 600, "fy": 550, "ppx": 30, "ppy": 20, "depth_scale": 1e-4}),
         (0.1, {"intrinsic_matrix": K.T.ravel().tolist(), "depth_scale": 1e4}),
+        (0.2, {"fx": 600, "fy": 550, "cx": 30, "cy": 20, "factor_depth": 5000}),
         (0.25, K),
     ],
 )
@@ -455,10 +456,20 @@ def raw_camera(form, c):
             }
         },
         "Azure": {**numbers, **middle, "codx": 0.0, "cody": 0.0, **c},
+        "JSON": {"K": k, "dist": [listed], "distortion_corrected": False},
+        "Kalibr": {
+            **numbers,
+            **middle,
+            "camera_model": "pinhole",
+            "distortion_model": "radtan",
+            "distortion_coeffs": listed,
+        },
     }[form]
 
 
-@pytest.mark.parametrize("form", ["ROS", "message", "OpenCV", "RealSense", "Zivid", "Azure"])
+@pytest.mark.parametrize(
+    "form", ["ROS", "message", "OpenCV", "RealSense", "Zivid", "Azure", "JSON", "Kalibr"]
+)
 @pytest.mark.parametrize("c", [PLUMB, RATIONAL])
 def test_the_rays_of_a_raw_image_bend_to_its_pixels(form, c):
     depth = np.random.default_rng(0).uniform(0.4, 0.5, SIZE)
@@ -486,6 +497,8 @@ def test_the_rays_of_a_raw_image_bend_to_its_pixels(form, c):
         ({"d": [0.1, 0.0, 0.0, 0.0], "distortion_model": "fisheye"}, "model fisheye"),
         ({"coeffs": [0.1] * 5, "model": "Inverse Brown Conrady"}, "model inverse_brown_conrady"),
         ({"coeffs": [0.1] * 5}, "of no model"),
+        ({"k1": 0.1, "camera_model": "OPENCV_FISHEYE"}, "model opencv_fisheye"),
+        ({"RadialDistortion": [0.1, 0.0]}, "radialdistortion [0.1, 0.0], which is not read"),
         ({"d": [0.1] * 12}, "at most k1 k2 p1 p2 k3 k4 k5 k6"),
         ({"d": [0.1, 0.2]}, "at most k1"),
         ({"k1": 0.1, "codx": 0.01}, "at most k1"),

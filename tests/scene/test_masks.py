@@ -156,7 +156,7 @@ def test_a_mask_of_object_and_table_is_trimmed_with_a_note():
         ),
         (np.stack([100 * LABELS, 50 * LABELS, 0 * LABELS]), "mask 1 with numbers from 100 to 200"),
         ([LABELS], "mask 1 with numbers from 1 to 2"),
-        ([255 * (LABELS == 1) + 3 * (LABELS == 2), LABELS == 2], "from 3 to 255.*mask > 127"),
+        ([255 * (LABELS == 1) + 3 * (LABELS == 2), LABELS == 2], "mask > 127.*from 3 to 255"),
     ],
 )
 def test_masks_that_would_be_joined_are_refused(given, message):

@@ -28,6 +28,8 @@ ATTRIBUTES = (
     *("width", "height", "roi", "binning_x", "binning_y"),
 )
 """Names of the attributes of an object that describes a camera."""
+COUNTS = ("factor_depth", "depth_factor", "png_depth_scale", "depthmapfactor")
+"""Names of the counts of a metre: of GraspNet, NICE-SLAM and ORB-SLAM."""
 SIDES = ("x_offset", "y_offset", "width", "height")
 """Names of the numbers of ROS's region of interest."""
 SCALES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4)
@@ -205,7 +207,9 @@ def _read_written(value: object) -> Written:
     width = named.get("width", named.get("image_width"))
     height = named.get("height", named.get("image_height"))
     scale = named.get("depth_scale")
-    for name, x in (("width", width), ("height", height), ("depth_scale", scale)):
+    counts = next((named[name] for name in COUNTS if named.get(name) is not None), None)
+    stated = {"width": width, "height": height, "depth_scale": scale, "depth factor": counts}
+    for name, x in stated.items():
         if x is not None and (not _is_table([x]) or not 0 < x < LIMITS.greatest):
             found = f"{name} = {str(x)[:SHOWN_LETTERS]!r}"
             raise BadArgument("intrinsics", found, f"a positive {name}")
@@ -214,6 +218,8 @@ def _read_written(value: object) -> Written:
         scale = 1 / scale
     elif scale is not None and "ppx" not in named:
         scale = scale / 1000.0
+    elif scale is None and counts is not None:
+        scale = 1 / counts
     size = None if width is None or height is None else [float(width), float(height)]
     return Written(table, size, scale, _read_window(named), lens)
 

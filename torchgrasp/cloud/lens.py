@@ -17,12 +17,20 @@ from torchgrasp.foundation.limits import SHOWN_LETTERS
 
 NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of the rational model, in the order of OpenCV and ROS."""
-LISTS = ("d", "distortion_coefficients", "dist_coeffs", "coeffs", "distortion")
-"""Names of a list of coefficients, or of an object that holds them: of ROS, RealSense and Zivid."""
+LISTS = (
+    *("d", "distortion_coefficients", "dist_coeffs", "coeffs", "distortion"),
+    *("dist", "distcoeffs", "dist_coefs", "distortion_coeffs", "distortion_coefs", "kc"),
+)
+"""Names of a list of coefficients, or of an object that holds them: of ROS, RealSense, Zivid,
+OpenCV's examples, Kalibr and Bouguet's toolbox.
+"""
 OFF_CENTRE = ("codx", "cody")  # Azure Kinect's centre of distortion, 0 in its devices
-MODELS = ("distortion_model", "model", "model_type", "modeltype")  # names of the model's name
+MODELS = ("distortion_model", "model", "model_type", "modeltype", "camera_model")
+"""Names of the model's name."""
+LIKE = "distortion"
+"""Part of the names of other coefficients, such as MATLAB's RadialDistortion."""
 POLYNOMIAL = (
-    *("plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", ""),
+    *("plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole", ""),
     "calibration_lensdistortionmodelbrownconrady",
 )
 """Models that OpenCV's rational polynomial covers. RealSense's inverse and modified ones differ."""
@@ -147,6 +155,11 @@ def read_lens(named: Mapping[str, Any]) -> Lens | None:
     by_name = {name: numbers_of(found.get(name)) for name in (*NAMES, *OFF_CENTRE)}
     given = {name: x[0] for name, x in by_name.items() if x}
     every = [*values, *given.values()]
+    for other, value in named.items():
+        known = other in (*LISTS, *MODELS) or isinstance(value, bool)
+        if LIKE in other and not known and any(numbers_of(value)):
+            bent = f"{other[:SHOWN_LETTERS]} {describe(value)}, which is not read"
+            raise BadArgument("intrinsics", bent, "distortion as D, in the order k1 k2 p1 p2 k3")
     # NaN is no small number
     if all(abs(x) <= LENS.straight for x in every):
         return None
