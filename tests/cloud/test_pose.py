@@ -342,6 +342,42 @@ def test_a_transposed_image_is_told_in_the_camera_s_own_frame():
     assert "on its side" in note and "depth.T" in note
 
 
+@functools.cache
+def wrong_images():
+    """A wrong image of each kind, the camera, and what is said of it."""
+    depth, pose = seen()
+    near, _ = masked()
+    fx, fy, cx, cy = (float(x) for x in (HALF[0, 0], HALF[1, 1], HALF[0, 2], HALF[1, 2]))
+    row, column = torch.meshgrid(*map(torch.arange, depth.shape), indexing="ij")
+    long = torch.sqrt(((column - cx) / fx) ** 2 + ((row - cy) / fy) ** 2 + 1)
+    inverted = torch.where(depth > 0, 0.3 / depth.clamp_min(1e-6), 0.0)
+    return {
+        "right": (depth, near, (HALF, None), "^$"),
+        "right, with its pose": (depth, near, (HALF, pose), "^$"),
+        "along rays": (depth * long, near, (HALF, pose), "distance along the ray"),
+        "inverse": (inverted, near, (HALF, None), "inverse depths, such as disparities"),
+        "inverse, of the object alone": (torch.where(near, inverted, 0), near, (HALF, None), "^$"),
+        "upside down": (depth.flip(0), near.flip(0), (HALF, None), r"depth\[::-1\]"),
+        "transposed": (depth.T, near.T, ((fy, fx, cy, cx), None), r"depth\.T"),
+        "of another lens": (depth, near, ((1.4 * fx, 1.4 * fy, cx, cy), pose), "focal length"),
+    }
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("right", "right, with its pose", "along rays", "inverse", "inverse, of the object alone"),
+        *("upside down", "transposed", "of another lens"),
+    ],
+)
+def test_the_cloud_of_a_mask_is_told_of_a_wrong_image_as_its_scene_is(name):
+    image, mask, (camera, pose), said = wrong_images()[name]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        cloud_from_depth(image, camera, mask, pose)
+    assert re.search(said, " ".join(str(one.message) for one in caught))
+
+
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("off", [-0.3, -0.02, 0.015, 0.05])
 def test_a_given_table_beside_the_layer_of_the_points_is_told(view, off):

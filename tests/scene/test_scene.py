@@ -9,11 +9,11 @@ from tests.make import HALF, box, halved
 from torchgrasp import Scene, load_scene, plan_scene, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at
 from torchgrasp.cloud.camera import render_depth as render_whole
+from torchgrasp.cloud.rays import RAYS, tell_rays
 from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.creases import cut_creases
-from torchgrasp.scene.image import RAYS, DepthImage, tell_rays
 from torchgrasp.values.planning import PointCloud
 
 POSE = look_at(20.0, 45.0, 0.6)
@@ -333,10 +333,23 @@ def test_distances_along_rays_are_told(elevation):
         assert any("distance along the ray of each pixel" in note for note in told)
 
 
+@pytest.mark.parametrize("elevation", [35.0, 60.0])
+def test_inverse_depths_are_told(elevation):
+    pose = look_at(20.0, elevation, 0.6)
+    depth, _ = render_depth(things(), pose)
+    inverse = torch.where(depth > 0, 0.3 / depth.clamp_min(1e-6), 0.0)
+    for given in ({}, {"camera_pose": pose}):
+        try:
+            told = Scene.from_depth(inverse, K, **given).notes
+        except (BadArgument, NoSupport) as error:
+            told = (str(error),)
+        assert any("inverse depths, such as disparities" in note for note in told)
+
+
 def test_few_pixels_tell_nothing_of_rays():
     pose = look_at(20.0, 35.0, 0.6)
     depth, _ = render_depth(things(), pose)
     few = torch.zeros_like(depth)
     few[::80, ::80] = depth[::80, ::80]
     assert 0 < int((few > 0).sum()) < 16 * RAYS.fewest
-    assert tell_rays(DepthImage(few, K, pose)) == ()
+    assert tell_rays(few, K) == ()

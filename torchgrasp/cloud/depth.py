@@ -18,7 +18,8 @@ from torchgrasp.cloud.intrinsics import (
     parse_intrinsics,
 )
 from torchgrasp.cloud.lens import Lens, describe
-from torchgrasp.cloud.pose import check_view, read_camera_pose, tell_far
+from torchgrasp.cloud.pose import check_view, read_camera_pose, tell_far, tell_tilt
+from torchgrasp.cloud.rays import tell_rays
 from torchgrasp.cloud.sensor import Image
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, CloudWarning, MendedInput, TooFewPoints
@@ -26,6 +27,7 @@ from torchgrasp.foundation.rules import Positive
 from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import Points, unit
+from torchgrasp.geometry.support_search import Target
 from torchgrasp.values.planning import PointCloud
 
 Array = Tensor | np.ndarray
@@ -63,6 +65,12 @@ class DepthNumbers:
     """Least share of a mask's pixels with one number that may be another object."""
     viewed: int = 5000
     """Number of points, about, by which a table in the view is compared with the pose."""
+    whole: float = 0.5
+    """Least share of the measured pixels in a mask without much around it."""
+    afloat: float = 0.15
+    """Greatest height [m] of the object in the mask above its table: what stands before it hides
+    less.
+    """
 
 
 DEPTH = DepthNumbers()
@@ -139,12 +147,22 @@ def cloud_from_depth(
             "rays; leave it out for a rectified image",
         )
     pose = (torch.eye(4) if camera_pose is None else read_camera_pose(camera_pose)).to(points)
+    notes = tuple[str, ...]()
     # Without a mask, the image may show the object alone, without a table.
     if inside is not None:
         view = apply(pose, _points(z_image, k, seen, lens))
-        view = view[:: 1 + len(view) // DEPTH.viewed]
-        check_view(view, pose.cpu(), up, depth_unit is not None)
-    for note in (*tell_far(pose), *tell_step(z_image)):
+        view = view[:: 1 + len(view) // DEPTH.viewed].cpu()
+        own = apply(pose, points)[:: 1 + len(points) // DEPTH.viewed].cpu()
+        target = Target(own, DEPTH.afloat)
+        support = check_view(view, pose.cpu(), up, depth_unit is not None, target)
+        if support is not None and up is None:
+            notes += tell_tilt(pose.cpu(), support.plane)
+        # an image that a lens bends shows no plane, and one of the object alone no table
+        around = lens is None and count < DEPTH.whole * int(seen.sum())
+        if around and (support is None or support.local or notes):
+            notes += tell_rays(z_image.cpu(), k.cpu())
+    notes += (*tell_far(pose), *tell_step(z_image))
+    for note in notes:
         warn_user(CloudWarning, note)
 
     viewpoint = pose[:3, 3]

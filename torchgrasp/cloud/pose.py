@@ -327,14 +327,23 @@ def _level(
     return tuple(support for support in supports if float(support.plane.normal[2]) > POSE.wall)
 
 
-def check_view(points: Points, pose: Transform, up: object, known_unit: bool) -> None:
-    """Raise `BadArgument` if a table in the view contradicts the camera's pose or the depth's unit.
+def check_view(
+    points: Points, pose: Transform, up: object, known_unit: bool, target: Target
+) -> SupportPlane | None:
+    """Return the table in a view, or None if none is found. Raise `BadArgument` if it contradicts
+    the camera's pose or the depth's unit.
 
-    `points` (n, 3) [m] are in the frame to which the `pose` leads. `up` is the direction against
-    gravity there; None means z. `known_unit` is whether the user gave the unit of the depth.
+    `points` (n, 3) [m] are in the frame to which the `pose` leads, and so is the `target`. `up` is
+    the direction against gravity there; None means z. `known_unit` is whether the user gave the
+    unit of the depth.
     """
-    with contextlib.suppress(NoSupport):
-        _check_supports(find_table(points, pose[:3, 3], None, None), pose, up, known_unit)
+    image_up = -pose[:3, 1] if up is None and _is_own(pose) else None
+    try:
+        supports = find_table(points, pose[:3, 3], None, None, target, image_up)
+    except NoSupport:
+        return None
+    _check_supports(supports, pose, up, known_unit)
+    return supports[0]
 
 
 def _is_own(pose: Transform) -> bool:

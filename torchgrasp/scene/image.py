@@ -62,25 +62,6 @@ class ProjectionNumbers:
     """Least extent of a view at depth 1, so that nothing is divided by 0."""
 
 
-@dataclasses.dataclass(frozen=True)
-class RayNumbers:
-    """Parameters of the search for depths that are distances from the camera."""
-
-    near: float = 0.005
-    """Greatest distance [m] of points from a plane on which they lie."""
-    drawn: int = 5000
-    """Number of points, about, to which planes are fitted."""
-    patches: int = 4
-    """Patches along a side of the image at which the search for a plane starts."""
-    fewest: int = 20
-    """Fewest points to which a plane is fitted."""
-    fits: int = 4
-    """Number of fits, each to the points near the plane of the fit before."""
-    better: float = 1.3
-    """Least share of points on the plane, over the share with the depths as they are."""
-
-
-RAYS = RayNumbers()
 IMAGE = ImageNumbers()
 PROJECTION = ProjectionNumbers()
 
@@ -198,46 +179,6 @@ def read_image(
     if (count := int((z > 0).sum())) < IMAGE.least_pixels:
         raise BadArgument("depth", f"{count} measured pixels", f"at least {IMAGE.least_pixels}")
     return DepthImage(z.cpu(), k.cpu(), pose)
-
-
-def tell_rays(image: DepthImage) -> tuple[str, ...]:
-    """Return one note, a sentence, if the depths are perhaps distances from the camera, else none.
-
-    Read as distances, they would put over 1.3 times as many points (`RAYS.better`) into one plane.
-    """
-    row, column = torch.nonzero(image.depth > 0, as_tuple=True)
-    step = 1 + len(row) // RAYS.drawn
-    row = row[::step]
-    column = column[::step]
-    # in the camera's frame: as they are, and at their depth along their rays
-    seen = dataclasses.replace(image, obj_from_camera=torch.eye(4)).points()[row, column]
-    nearer = seen[:, 2:] * unit(seen)
-    height, width = image.depth.shape
-    patch = row * RAYS.patches // height * RAYS.patches + column * RAYS.patches // width
-    # of few points, neither share is known
-    if _share_flat(nearer, patch) <= RAYS.better * _share_flat(seen, patch):
-        return ()
-    found = "the support is flat if the depth is the distance along the ray of each pixel"
-    fix = "the depth along the optical axis, distance / sqrt(1 + ((u-cx)/fx)^2 + ((v-cy)/fy)^2)"
-    return (f"{found}: then give {fix}",)
-
-
-def _share_flat(points: Points, patch: Int[Tensor, "n"]) -> float:
-    """Return the greatest share of `points` (n, 3) [m] in one plane; 0 if no patch has enough.
-
-    A plane is fitted to each patch of the image, then to all points near it.
-    """
-    best = 0.0
-    for one in patch.unique().tolist():
-        part = patch == one
-        for _ in range(RAYS.fits):
-            if int(part.sum()) < RAYS.fewest:
-                break
-            middle = points[part].mean(0)
-            normal = torch.linalg.svd(points[part] - middle, full_matrices=False).Vh[2]
-            part = ((points - middle) @ normal).abs() < RAYS.near
-            best = max(best, float(part.double().mean()))
-    return best
 
 
 def scale_pixels(count: int, labels: Int[Tensor, "h w"]) -> float:

@@ -17,6 +17,7 @@ from torchgrasp.cloud.pose import (
     tell_layer,
     tell_tilt,
 )
+from torchgrasp.cloud.rays import tell_rays
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.foundation.base import Value, kept, settle
 from torchgrasp.foundation.checks import checked
@@ -34,7 +35,6 @@ from torchgrasp.scene.image import (
     find_nearest,
     image_of_cloud,
     read_image,
-    tell_rays,
 )
 from torchgrasp.scene.leaning import tell_leaning
 from torchgrasp.scene.masks import label_image, read_labels, read_mask
@@ -205,7 +205,7 @@ class Scene(Value):
                 _target(points[measured], None if inside is None else inside[measured]),
             )
         except NoSupport as error:
-            if rays := tell_rays(image):
+            if rays := tell_rays(image.depth, image.intrinsics):
                 raise NoSupport("table", error.found, f"{error.allowed}; {rays[0]}") from None
             raise
         found, notes = label_image(TableImage(image, points, supports[0]), given, inside)
@@ -217,10 +217,13 @@ class Scene(Value):
             notes += tell_furniture(points[measured], found[measured])
         if table is not None:
             notes += tell_layer(points[measured], supports[0].plane)
-        elif supports[0].local:
-            notes += (LOCAL, *tell_rays(image))
-        if table is None and up is None:
-            notes += tell_tilt(image.obj_from_camera, supports[0].plane)
+        bowed = table is None and supports[0].local
+        notes += (LOCAL,) * bowed
+        tilted = table is None and up is None
+        tilt = tell_tilt(image.obj_from_camera, supports[0].plane) if tilted else ()
+        if bowed or tilt:
+            notes += tell_rays(image.depth, image.intrinsics)
+        notes += tilt
         notes += tell_step(image.depth)
         notes += tell_leaning(
             points[measured],
