@@ -219,3 +219,23 @@ def test_what_other_threads_log_meanwhile_is_kept(tmp_path, caplog, monkeypatch)
     cube().export(tmp_path / "box.stl")
     read_mesh(tmp_path / "box.stl")
     assert [record.message for record in caplog.records] == ["of another"]
+
+
+@pytest.mark.parametrize("first", range(6))
+def test_a_concave_polygon_whose_notch_is_covered_is_refused(tmp_path, first):
+    """A fan from the reflex corner, number 3, or the one across it, covers an L and no more."""
+    outline = np.array([(0, 0), (6, 0), (6, 2), (2, 2), (2, 6), (0, 6)]) / 100
+    corners = [(x, y, z) for z in (0.0, 0.05) for x, y in outline]
+    low = np.roll(np.arange(6), -first)
+    faces = [low[[0, 5, 4, 3, 2, 1]], low + 6]
+    faces += [[i, (i + 1) % 6, (i + 1) % 6 + 6, i + 6] for i in range(6)]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners]
+    lines += ["f " + " ".join(str(k + 1) for k in face) for face in faces]
+    path = tmp_path / "angle.obj"
+    path.write_text("\n".join(lines))
+    if first in (0, 3):
+        # two faces of 20 cm2, and an outline of 24 cm, 5 cm high
+        assert read_mesh(path).area == pytest.approx(2 * 0.0020 + 0.24 * 0.05)
+    else:
+        with pytest.raises(MeshError, match="folded onto other faces"):
+            read_mesh(path)

@@ -31,6 +31,8 @@ MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12  # least volume [m^3] of a body
 MOST_INWARD = 100  # most bodies turned inward that are looked at, the largest ones
 LEAST_SPAN = 1e-40  # least squared double area [m4] of a triangle that is divided by
+FOLD = 3.1398  # least angle [rad] between faces that lie on each other: 179.9 degrees
+MOST_FOLDED = 0.01  # greatest share of the surface that is folded: scans have less than 0.1 %
 STALE_NORMAL = 1e-4  # least difference of unit normals that no rounding of a file explains
 # a binary .stl: title, 32-bit count of faces, and bytes of each face
 STL_TITLE = 80
@@ -47,7 +49,7 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
         MeshError: the file is no .obj, .off, .ply or .stl file, or has more than 50 MiB.
         MeshError: the mesh has no faces, or more than 500,000.
         MeshError: the mesh has vertices that are not finite, an open surface, or no volume.
-        MeshError: the faces are not all turned outward.
+        MeshError: the faces are not all turned outward, or many lie on each other.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the
             unit is mm.
     """
@@ -69,6 +71,11 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
             raise MeshError("mesh", f"{path}, which holds no faces", "a closed triangle mesh")
         mesh = loaded
     check_solid(mesh, name)
+    folded = _folded_share(mesh)
+    if folded > MOST_FOLDED:
+        found = f"{name} with {folded:.0%} of its surface folded onto other faces"
+        allowed = "faces side by side: make triangles of concave polygons before they are saved"
+        raise MeshError("mesh", found, allowed)
     extent = float(mesh.extents.max())
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
         raise SuspiciousScale(
@@ -108,6 +115,17 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
             f"{name} without inertia, as of a body turned inward",
             "every face turned outward",
         )
+
+
+def _folded_share(mesh: "trimesh.Trimesh") -> float:
+    """Return the share of a mesh's surface whose faces lie on neighbours that face the other way.
+
+    Readers split polygons into fans. The fan of a concave polygon covers its notch twice, with
+    opposite faces: volume and closedness are right, and the surface is not.
+    """
+    on_each_other = mesh.face_adjacency_angles > FOLD
+    pairs = mesh.face_adjacency[on_each_other]
+    return float(mesh.area_faces[pairs].min(1).sum() / mesh.area)
 
 
 def _inward_volume(mesh: "trimesh.Trimesh") -> float:
