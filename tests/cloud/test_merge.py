@@ -11,7 +11,7 @@ from torchgrasp.cloud.diagnose import diagnose_cloud, format_report
 from torchgrasp.cloud.prepare import clean_cloud, merge_clouds
 from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.data.shipped import load_object
-from torchgrasp.foundation.errors import BadArgument, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, CloudWarning, TooFewPoints
 from torchgrasp.geometry.frames import apply, inverse, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
@@ -118,6 +118,20 @@ def test_merge_clouds_refuses_what_does_not_fit(two_views):
     ):
         with pytest.raises(BadArgument, match=words):
             merge_clouds(clouds, poses)
+
+
+def test_views_to_which_one_pose_was_given_are_told(two_views):
+    first, second = (
+        PointCloud(view.points - view.viewpoint, None, torch.zeros(3).double())
+        for view in two_views
+    )
+    poses = [shift(*view.viewpoint.tolist()) for view in two_views]
+    assert len(merge_clouds([first, second], poses)) == 1200
+    with pytest.warns(CloudWarning, match="clouds 0 and 1 were seen from one place"):
+        merge_clouds([first, first], [poses[0], poses[0]])
+    # cameras that are guessed tell nothing
+    nowhere = PointCloud(first.points)
+    assert len(merge_clouds([nowhere, nowhere], [EYE, EYE])) == 1200
 
 
 def around(mesh, azimuths, noise="realsense"):

@@ -32,6 +32,7 @@ from torchgrasp.values.planning import PointCloud
 FACING = 0.9  # least share of a view's normals that face the camera; noise turns some at the rim
 ACROSS = "across the surface of the points (colours?)"
 INWARD = "to the middle of the points: give outward ones, or none, unless only a hollow is seen"
+SAME_PLACE = 6  # decimals [m] in which two cameras of one place are alike
 MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time of the selection
 
 
@@ -373,6 +374,8 @@ def merge_clouds(
     view has normals but no viewpoint. Points are denser where views overlap; `voxel_downsample`
     makes the density even.
 
+    Two views from one place raise a `CloudWarning`: perhaps one pose was given twice.
+
     Overlapping views are compared. If they are farther apart than noise explains, `MendedInput`
     warns. Their distance becomes the result's `pose_error` [m], which widens the standard
     deviations of a shape.
@@ -393,7 +396,8 @@ def merge_clouds(
     2 m].
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
-    >>> len(merge_clouds([view, view], [torch.eye(4), torch.eye(4)]))
+    >>> other = PointCloud(view.points, viewpoint=torch.tensor([0.1, 0.0, 1.0]))
+    >>> len(merge_clouds([view, other], [torch.eye(4), torch.eye(4)]))
     180
     """
     if not len(clouds):
@@ -413,6 +417,7 @@ def merge_clouds(
         return views[0]
     if align:
         views = [_move(view, *moved) for view, moved in zip(views, align_views(views), strict=True)]
+    _tell_same_place(clouds, views)
     errors = _compare_views(clouds, views)
     normals = [v.normals for v in views if v.normals is not None]
     # Each point has its camera: a view's viewpoint and frustum are repeated for its points.
@@ -430,6 +435,24 @@ def _move(view: PointCloud, pose: Transform, error: float) -> PointCloud:
     view = _view_in_frame(view, pose)
     known = view.points.new_zeros(len(view)) if view.pose_error is None else view.pose_error
     return dataclasses.replace(view, pose_error=known.clamp_min(error))
+
+
+def _tell_same_place(clouds: Sequence[PointCloud], views: Sequence[PointCloud]) -> None:
+    """Warn (`CloudWarning`) of two views from one place: perhaps one pose was given twice.
+
+    `views` are the `clouds` in one frame.
+    """
+    eyes = dict[tuple[float, ...], int]()
+    for k, (cloud, view) in enumerate(zip(clouds, views, strict=True)):
+        # a guessed camera tells nothing, and neither do those of several views
+        if cloud.viewpoint is None or view.viewpoint is None or view.viewpoint.ndim != 1:
+            continue
+        eye = tuple(round(x, SAME_PLACE) for x in view.viewpoint.tolist())
+        if eye in eyes:
+            found = f"clouds {eyes[eye]} and {k} were seen from one place"
+            fix = "give each view the pose of its own camera; of one camera, take median_depth"
+            warn_user(CloudWarning, f"poses: {found}: {fix}")
+        eyes[eye] = k
 
 
 def _compare_views(clouds: Sequence[PointCloud], views: Sequence[PointCloud]) -> Float[Tensor, "n"]:
