@@ -120,15 +120,18 @@ def test_merge_clouds_refuses_what_does_not_fit(two_views):
             merge_clouds(clouds, poses)
 
 
-def test_views_to_which_one_pose_was_given_are_told(two_views):
+def test_views_to_which_one_pose_was_given_are_told():
+    mesh = load_object("cylinder").mesh
+    poses = [look_at(azimuth, 35.0, target=mesh).double() for azimuth in (60.0, 120.0)]
+    views = [partial_view(mesh, pose, 600) for pose in poses]
     first, second = (
-        PointCloud(view.points - view.viewpoint, None, torch.zeros(3).double())
-        for view in two_views
+        PointCloud(apply(inverse(pose), view.points), None, torch.zeros(3).double())
+        for view, pose in zip(views, poses, strict=True)
     )
-    poses = [shift(*view.viewpoint.tolist()) for view in two_views]
     assert len(merge_clouds([first, second], poses)) == 1200
     with pytest.warns(CloudWarning, match="clouds 0 and 1 were seen from one place"):
-        merge_clouds([first, first], [poses[0], poses[0]])
+        merge_clouds([first, second], [poses[0], poses[0]])
+    assert len(merge_clouds([first, first], [poses[0], poses[0]])) == 1200
     # cameras that are guessed tell nothing
     nowhere = PointCloud(first.points)
     assert len(merge_clouds([nowhere, nowhere], [EYE, EYE])) == 1200

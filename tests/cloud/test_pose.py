@@ -14,7 +14,7 @@ from tests.make import HALF, box, halved
 from torchgrasp import Scene, read_scene, save_scene
 from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.cloud.pose import read_camera_pose, read_pose, tell_furniture
+from torchgrasp.cloud.pose import read_camera_pose, read_pose, tell_furniture, tell_inverse
 from torchgrasp.cloud.prepare import merge_clouds
 from torchgrasp.foundation.errors import BadArgument, CloudWarning, MendedInput, NoSupport
 from torchgrasp.foundation.rules import is_rigid
@@ -290,6 +290,22 @@ def test_a_pose_beyond_the_angle_is_refused_with_it():
             check(pose)
     with pytest.raises(BadArgument, match=r"0\.\d+ degrees from the nearest rotation"):
         Plane.horizontal(0.0).moved(pose)
+
+
+def test_an_inverse_pose_is_told_where_no_table_is_seen():
+    turn = rotation_from_vector(torch.tensor([0.0, 0.0, math.pi]).double())
+    overhead = look_at(20.0, 89.9, 0.7)
+    hanging = seen()[1] @ rigid(turn, torch.zeros(3).double())
+    for azimuth in (-150.0, -40.0, 20.0, 160.0):
+        right = look_at(azimuth, 45.0, 0.7)
+        assert tell_inverse(right) == ()
+        (note,) = tell_inverse(inverse(right))
+        assert "give its inverse, if it leads to the camera's frame" in note
+    for right in (overhead, hanging, rolled()[1], torch.eye(4).double()):
+        assert tell_inverse(right) == ()
+    image = np.full((48, 64), 0.5)
+    with pytest.warns(CloudWarning, match="rolled by .* degrees, and by the inverse"):
+        cloud_from_depth(image, (600.0, 600.0, 31.5, 23.5), camera_pose=inverse(seen()[1]))
 
 
 def test_views_are_merged_by_poses_of_few_decimals():

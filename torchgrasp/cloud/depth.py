@@ -18,7 +18,7 @@ from torchgrasp.cloud.intrinsics import (
     parse_intrinsics,
 )
 from torchgrasp.cloud.lens import Lens, describe
-from torchgrasp.cloud.pose import check_view, read_camera_pose, tell_far, tell_tilt
+from torchgrasp.cloud.pose import check_view, read_camera_pose, tell_far, tell_inverse, tell_tilt
 from torchgrasp.cloud.rays import tell_rays
 from torchgrasp.cloud.sensor import Image
 from torchgrasp.foundation.checks import checked
@@ -162,6 +162,7 @@ def cloud_from_depth(
         if around and (support is None or support.local or notes):
             notes += tell_rays(z_image.cpu(), k.cpu())
     notes += (*tell_far(pose), *tell_step(z_image))
+    notes += tell_inverse(pose) if up is None else ()
     for note in notes:
         warn_user(CloudWarning, note)
 

@@ -62,6 +62,12 @@ class PoseNumbers:
     """Least median depth [m] of a view in which a table should have been found."""
     deep: float = 4.0
     """Greatest median depth [m] of such a view."""
+    roll: float = 20.0
+    """Least roll [deg] of a camera whose inverse pose is suggested if it has none. Cameras roll by
+    less, hang upside down, or lie on their side.
+    """
+    upright: float = 2.0
+    """Greatest roll [deg] of a camera that stands upright, as most do."""
     turn: float = 0.985
     """A rotation is nearly none if the diagonal of its matrix is above this: about 10 degrees."""
     shift: float = 0.1
@@ -234,6 +240,22 @@ def tell_far(pose: Transform) -> tuple[str, ...]:
         return ()
     fix = "if camera_pose is in cm, divide camera_pose[:3, 3] by 100"
     return (f"the camera is {distance:.3g} m from the origin of its frame: {fix}",)
+
+
+def tell_inverse(pose: Transform) -> tuple[str, ...]:
+    """Return one note if the inverse of a pose is that of an upright camera, else none.
+
+    In the frame of the pose, z is up. Without a table in view, nothing else shows an inverse pose.
+    """
+    roll = math.degrees(math.asin(min(1.0, abs(float(pose[2, 0])))))
+    other = math.degrees(math.asin(min(1.0, abs(float(pose[0, 2])))))
+    rolled = POSE.roll < roll < 90.0 - POSE.roll
+    # y of the camera, which is down in the image, is down by the inverse pose
+    upright = other < POSE.upright and float(pose[1, 2]) < 0
+    if not rolled or not upright:
+        return ()
+    found = f"the camera is rolled by {roll:.0f} degrees, and by the inverse of its pose by none"
+    return (f"{found}: give its inverse, if it leads to the camera's frame",)
 
 
 def _check_distance(pose: Transform, distance: float, most: float, what: str) -> None:

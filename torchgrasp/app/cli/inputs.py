@@ -21,7 +21,7 @@ from torchgrasp.app.cli.command import arguments, naming, option
 from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, read_cloud_file
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers
 from torchgrasp.cloud.parts import cut_exact_table
-from torchgrasp.cloud.pose import read_camera_pose, read_pose, tell_far
+from torchgrasp.cloud.pose import read_camera_pose, read_pose, tell_far, tell_inverse
 from torchgrasp.contacts.region import Region
 from torchgrasp.files import hold_folder
 from torchgrasp.foundation.checks import check_tensor
@@ -115,6 +115,7 @@ class ViewOptions:
                 with naming(camera_pose="--camera-pose"):
                     pose = read_camera_pose(pose)
                 notes = (*notes, *tell_far(pose))
+                notes += tell_inverse(pose) if self.up is None else ()
                 cloud = _move(name, cloud, pose)
                 table = table and table.moved(pose)
                 notes = tuple(note for note in notes if "default viewpoint" not in note)
