@@ -340,6 +340,18 @@ def test_intrinsics_of_an_image_of_any_other_scale_are_refused_with_the_factor(s
     assert factor * scale == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.parametrize("size", [(480, 600), (440, 640), (420, 560)])
+def test_a_crop_whose_principal_point_was_kept_is_told(size):
+    image = np.full(size, 0.5)
+    with pytest.warns(CloudWarning, match="the middle of 640 x 480 px.*is a crop"):
+        read_depth(image, (616.0, 616.0, 319.5, 239.5))
+    # warnings are errors: nothing is told of the crop's own size, point, or of a camera's image
+    height, width = size
+    read_depth(image, (616.0, 616.0, 319.5, 239.5, width, height))
+    read_depth(image, (616.0, 616.0, (width - 1) / 2 + 3, (height - 1) / 2 - 2))
+    read_depth(np.full((480, 640), 0.5), (616.0, 616.0, 338.0, 229.0))
+
+
 def test_a_crop_with_its_own_principal_point_is_no_other_resolution():
     rng = np.random.default_rng(0)
     depth = np.full((480, 640), 500, dtype=np.uint16)

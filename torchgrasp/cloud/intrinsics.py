@@ -84,6 +84,10 @@ class IntrinsicsNumbers:
     """Least shift of a crop's corner, as a share of the side: a camera's principal point is off by
     less.
     """
+    cropped: float = 0.03
+    """Greatest shift of the principal point from the middle of a camera's image that was perhaps
+    cropped, and least shift from the middle of the crop. It is over half the side.
+    """
     centred: float = 0.05
     """Greatest shift of the principal point from the middle of a resolution that is guessed, over
     half the side.
@@ -372,6 +376,7 @@ def _check_size(k: Matrix, stated: list[float] | None, width: int, height: int) 
             sizes.append(image * scale.mean())
         near = [m for m in sizes if bool(((centre / m - 1).abs() < LIMITS.centred).all())]
         if not near or float((centre / image - 1).abs().max()) < LIMITS.off:
+            _tell_crop(image, centre)
             return
         own = near[0]
         found = f"a principal point ({k[0, 2]:.1f}, {k[1, 2]:.1f}) px in {shown}"
@@ -387,6 +392,25 @@ def _check_size(k: Matrix, stated: list[float] | None, width: int, height: int) 
         "of the crop"
     )
     raise BadArgument("intrinsics", found, f"intrinsics of the same resolution: {fix}{crop}")
+
+
+def _tell_crop(image: Float[Tensor, "2"], centre: Float[Tensor, "2"]) -> None:
+    """Warn (`CloudWarning`) of a size that no camera has, if the principal point is the middle of a
+    larger size that one has.
+
+    `image` is the (width, height) and `centre` twice the principal point [pixels].
+    """
+    modes = [image.new_tensor(mode) for mode in MODES]
+    own = float((centre / image - 1).abs().max())
+    if own < LIMITS.cropped or any(torch.equal(mode, image) for mode in modes):
+        return
+    whole = [mode for mode in modes if bool((mode >= image).all())]
+    whole = [mode for mode in whole if float((centre / mode - 1).abs().max()) < LIMITS.cropped]
+    if whole:
+        size, full = (" x ".join(f"{side:g}" for side in sides) for sides in (image, whole[0]))
+        found = f"intrinsics: a principal point in the middle of {full} px, and an image of {size}"
+        fix = "if the image is a crop, take its corner from cx and cy, and give width and height"
+        warn_user(CloudWarning, f"{found}: {fix}")
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
