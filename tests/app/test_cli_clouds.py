@@ -533,7 +533,10 @@ def test_depth_makes_a_cloud_of_the_mask(suffix, tmp_path, capsys):
     else:
         Image.fromarray(mm).save(path)
     Image.fromarray(mask).save(tmp_path / "m.png")
-    np.savetxt(tmp_path / "pose.txt", POSE.numpy())
+    # the camera looks straight down on the plane, as on a table
+    pose = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()
+    pose[:3, 3] = torch.tensor([0.3, -0.2, 0.5])
+    np.savetxt(tmp_path / "pose.txt", pose.numpy())
     options = [*K, "--mask", str(tmp_path / "m.png"), "--out", str(tmp_path / "c.npz")]
     assert cli.main(["cloud", "depth", str(path), *options]) == 0
     still = read_cloud(tmp_path / "c.npz")
@@ -545,8 +548,8 @@ def test_depth_makes_a_cloud_of_the_mask(suffix, tmp_path, capsys):
         == 0
     )
     moved = read_cloud(tmp_path / "c.npz")
-    torch.testing.assert_close(moved.points, still.points @ POSE[:3, :3].T + POSE[:3, 3])
-    torch.testing.assert_close(moved.viewpoint, POSE[:3, 3])
+    torch.testing.assert_close(moved.points, still.points @ pose[:3, :3].T + pose[:3, 3])
+    torch.testing.assert_close(moved.viewpoint, pose[:3, 3])
 
 
 BAD_DEPTH = {  # depth, mask, options, words

@@ -152,8 +152,8 @@ def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..
         exact = bool((numbers == read).all())
     except (TypeError, ValueError, OverflowError) as error:
         raise BadArgument(name, type(labels).__name__, whole) from error
-    # one channel, before or after the image
-    if read.shape in ((*shape, 1), (1, *shape), (1, 1, *shape)):
+    one_channel = [(*shape, 1), (1, *shape), (1, 1, *shape)]
+    if list(read.shape) in [list(size) for size in one_channel]:
         read = read.reshape(shape)
         numbers = numbers.reshape(shape)
     if len(shape) == 2 and read.shape in ((*shape, 3), (*shape, 4)) and exact:
