@@ -152,12 +152,12 @@ def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..
         exact = bool((numbers == read).all())
     except (TypeError, ValueError, OverflowError) as error:
         raise BadArgument(name, type(labels).__name__, whole) from error
-    one_channel = [(*shape, 1), (1, *shape), (1, 1, *shape)]
-    if list(read.shape) in [list(size) for size in one_channel]:
+    # one channel, before or after the image
+    if read.shape in ((*shape, 1), (1, *shape), (1, 1, *shape)):
         read = read.reshape(shape)
         numbers = numbers.reshape(shape)
     if len(shape) == 2 and read.shape in ((*shape, 3), (*shape, 4)) and exact:
-        colour = numbers[..., :3] * (numbers[..., 3:] > 0) if read.shape[-1] == 4 else numbers
+        colour = numbers[..., :3] * (numbers[..., 3:] > 0) if read.shape == (*shape, 4) else numbers
         return _dense(torch.from_numpy(np.abs(colour) @ COLOUR_PLACES))
     if read.shape != tuple(shape) or not exact:
         raise BadArgument(name, f"shape {read.shape}, {read.dtype}", whole)
