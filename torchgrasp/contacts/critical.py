@@ -32,6 +32,7 @@ from torchgrasp.contacts.balance import grasp_map
 from torchgrasp.contacts.form_closure import Vectors, count_contacts, scaled_arms, with_torque
 from torchgrasp.foundation.base import FINGERTIPS, flatnonzero, map_rows, row_numbers
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.foundation.rules import ANY, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
@@ -254,6 +255,11 @@ def _search(
     finite = finite.flatten(1).all(1) & torch.isfinite(load).all(1)
     left = flatnonzero(finite & ~degenerate(points))
     axes = torch.stack([-normals, *across(normals)], 2)  # (b, f, 3 axes, 3)
+    if is_fused(points, normals, load):
+        from torchgrasp.contacts import fused_critical  # it imports numba
+
+        good, balances = fused_critical.search(points[left], axes[left], load[left])
+        return left[good], LeastBalance(*(x[good] for x in balances))
     every = _Cones.of(points, axes, load)
     cones = every.some(left)
     at = cones.first()
