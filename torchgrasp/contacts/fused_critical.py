@@ -297,8 +297,8 @@ def _write_equations(f, each):
             by_mu = 1.0 / mu
             by_x = 1.0 / form_x
             by_s = 1.0 / form_s
-            unit_x = math.sqrt(by_x)
-            unit_s = math.sqrt(by_s)
+            unit_x = np.sqrt(by_x)
+            unit_s = np.sqrt(by_s)
             beta = unit_s * form_x * unit_x
             by_beta = unit_x * form_s * unit_s
             product = x0 * s0 + x1 * s1 + x2 * s2
@@ -306,7 +306,7 @@ def _write_equations(f, each):
             w0 = x0 * unit_x + s0 * unit_s
             w1 = x1 * unit_x - s1 * unit_s
             w2 = x2 * unit_x - s2 * unit_s
-            wide = math.sqrt(by_beta / gain)
+            wide = np.sqrt(by_beta / gain)
             narrow = beta * wide
             t0 = wide * w0
             t1 = -wide * w1
@@ -440,7 +440,7 @@ def _nearest(form, x, d):
     """Return the inverse of the longest share of the change d for which x stays in its cone."""
     along = x[0] * d[0] - x[1] * d[1] - x[2] * d[2]
     bend = d[0] * d[0] - d[1] * d[1] - d[2] * d[2]
-    root = math.sqrt(max(along * along - form * bend, 0.0))
+    root = np.sqrt(max(along * along - form * bend, 0.0))
     return (root - along) / form
 
 
@@ -596,7 +596,7 @@ def _start(n, f, each, common):
             for c in range(3):
                 each.forces[c, i, k] *= f / push
             push_i, one, two = _vector(each.forces, 0, i, k)
-            ratio = max(ratio, math.sqrt(one * one + two * two) / push_i)
+            ratio = max(ratio, np.sqrt(one * one + two * two) / push_i)
         friction = n.first * ratio + n.above
         total = 0.0
         for i in range(f):
@@ -623,7 +623,7 @@ def _balances(n, f, each, common, k):
         for i in range(f):
             total += dot(_row(each.rows, r, i, k), _vector(each.forces, 0, i, k))
         square += total * total
-    return math.sqrt(square) <= n.rounding and common.friction[k] <= n.most
+    return np.sqrt(square) <= n.rounding and common.friction[k] <= n.most
 
 
 @inlined
@@ -769,6 +769,7 @@ def search(
     motion = points.new_zeros(b, 7)
     given = np.array(numbers.shorter), array(axes), array(scaled_arms(points)), array(load)
     found = good, forces, friction, press, slide, motion
-    _search(values, *given, *(x.numpy() for x in found))
+    with np.errstate(all="ignore"):  # sets that cannot balance end with NaN
+        _search(values, *given, *(x.numpy() for x in found))
     twist, scale = motion.split([6, 1], 1)
     return good, critical.LeastBalance(forces, friction, press, slide, twist, scale[:, 0])
