@@ -578,40 +578,43 @@ def _start(n, f, each, common):
             each.right[8, i, k] = z4[0]
             each.right[10, i, k] = z5[0]
     _solve(each, common)
+    for i in range(f):
+        for k in range(4):
+            # without the pull of the equation of the sum
+            pull = _pull(each, 0, i, k)
+            push = 1.0 - each.solved[12, i, k] - pull[0]
+            _put(each.forces, 0, i, k, (push, -pull[1], -pull[2]))
+            each.room[i, k] = push
     for k in range(4):
-        least = math.inf
-        for i in range(f):
-            pull = (-1.0, 0.0, 0.0)
-            for r in range(6):
-                pull = add(pull, _row(each.rows, r, i, k), each.solved[2 * r, 0, k])
-            _put(each.forces, 0, i, k, (-pull[0], -pull[1], -pull[2]))
-            least = min(least, -pull[0])
-        push = 0.0
-        for i in range(f):
-            if not least > n.pushing:
-                _put(each.forces, 0, i, k, (1.0, 0.0, 0.0))
-            push += each.forces[0, i, k]
-        ratio = 0.0
-        for i in range(f):
-            for c in range(3):
-                each.forces[c, i, k] *= f / push
-            push_i, one, two = _vector(each.forces, 0, i, k)
-            ratio = max(ratio, np.sqrt(one * one + two * two) / push_i)
-        friction = n.first * ratio + n.above
-        total = 0.0
-        for i in range(f):
-            push_i, one, two = _vector(each.forces, 0, i, k)
-            x = friction * push_i
+        _spread(each.share, k, 1.0 if _least(each.room, k) > n.pushing else 0.0)
+    for i in range(f):
+        for k in range(4):
+            push, one, two = _vector(each.forces, 0, i, k)
+            pushes = each.share[i, k]
+            push = push if pushes > 0.0 else 1.0
+            _put(each.forces, 0, i, k, (push, pushes * one, pushes * two))
+            each.work[i, k] = push
+            each.nearest[i, k] = pushes * np.sqrt(one * one + two * two) / push
+    for k in range(4):
+        _spread(each.target, k, f / _sum(each.work, k))
+        common.friction[k] = n.first * _greatest(each.nearest, k) + n.above
+        _spread(each.friction, k, common.friction[k])
+    for i in range(f):
+        for k in range(4):
+            push, one, two = scale(_vector(each.forces, 0, i, k), each.target[i, k])
+            _put(each.forces, 0, i, k, (push, one, two))
+            x = each.friction[i, k] * push
             form = x * x - one * one - two * two
             _put(each.multipliers, 0, i, k, (x / form, -one / form, -two / form))
-            total += push_i * x / form
-        for i in range(f):
-            for c in range(3):
-                each.multipliers[c, i, k] /= total
-        common.friction[k] = friction
-        for r in range(6):
-            common.motion[r, k] = 0.0
-        common.motion[6, k] = -2.0 / total
+            each.work[i, k] = push * x / form
+    for k in range(4):
+        nu = 1.0 / _sum(each.work, k)
+        _spread(each.target, k, nu)
+        common.motion[6, k] = -2.0 * nu
+    for i in range(f):
+        for k in range(4):
+            multipliers = scale(_vector(each.multipliers, 0, i, k), each.target[i, k])
+            _put(each.multipliers, 0, i, k, multipliers)
 
 
 @inlined
@@ -650,6 +653,7 @@ def _search(n, shorter, axes, arms, load, good, forces, friction, press, slide, 
     next_each = _each_contact(begun)
     next_common = _each_set(begun)
     each.room[:] = math.inf  # of contacts that a set lacks
+    next_each.room[:] = math.inf
     owner = np.full(4, -1)
     step = np.zeros(4, np.int64)
     polished = np.zeros(4, np.int64)
