@@ -17,6 +17,8 @@ nu. Take a frame of the contact whose first axis is the inward normal. In it M_i
 and the form of the cone is J = diag(1, -1, -1). With the scaling point w of x and s, the matrix D =
 (2 J w w^T J - J) / beta maps x to s. Its inverse is beta (2 w w^T - J).
 
+Where compiled loops are used, one of them takes the same steps (`fused_critical`).
+
 [1] Andersen, Roos and Terlaky, Mathematical Programming 95, 2003.
 """
 
