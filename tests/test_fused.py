@@ -12,16 +12,19 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from tests.contacts.test_forces import tripods
 from tests.make import field_of_mesh, run_python, touched_contacts
 from torchgrasp import (
     Contacts,
     ContactSpec,
     PointCloud,
+    critical_friction,
     load_hand,
     load_object,
     plan_grasps,
     stream_grasps,
 )
+from torchgrasp.contacts.critical import least_balance
 from torchgrasp.contacts.form_closure import closed_exact, maximise
 from torchgrasp.contacts.problem import ContactProblem
 from torchgrasp.contacts.solver import Stage, descend, project, start_state
@@ -321,6 +324,37 @@ def test_linear_programmes(both):
     assert unbounded.any() and not unbounded.all()
     for one, other in zip(found, wanted, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize(("fingertips", "weight"), [(3, 0.0), (4, 0.3), (5, 0.0)])
+def test_the_least_friction_that_balances(both, fingertips, weight):
+    """More sets than lanes; one is on a line, one is not finite, and one cannot push."""
+    points, normals = tripods(8, 3, fingertips)
+    points[1] = points[1, :1] * (1 + torch.arange(fingertips)[:, None])
+    points[2, 0] = torch.nan
+    if fingertips == 3:
+        normals[3] = normals[3, :1]
+    load = torch.zeros(8, 6, dtype=torch.float64)
+    load[:, 2] = -weight
+    (rows, wanted), (found_rows, found) = both(lambda: least_balance(points, normals, load))
+    assert found_rows.tolist() == rows.tolist()
+    assert len(rows) == (5 if fingertips == 3 else 6)
+    torch.testing.assert_close(found.friction, wanted.friction, rtol=0, atol=1e-9)
+    for one, other in zip(found, wanted, strict=True):
+        assert_close(one, other, 1e-7)
+
+
+def test_a_derivative_of_the_critical_friction(both):
+    """It is that of the torch operations at the balance that the loop found."""
+    points, normals = tripods(2, 3)
+
+    def slope() -> torch.Tensor:
+        x = points.clone().requires_grad_()
+        return torch.autograd.grad(critical_friction(x, normals).sum(), x)[0]
+
+    wanted, found = both(slope)
+    assert wanted.abs().max() > 0.01
+    assert_close(found, wanted)
 
 
 @pytest.mark.parametrize("reachable", [None, lambda poses: poses[:, 2, 3] > 0])

@@ -17,6 +17,8 @@ nu. Take a frame of the contact whose first axis is the inward normal. In it M_i
 and the form of the cone is J = diag(1, -1, -1). With the scaling point w of x and s, the matrix D =
 (2 J w w^T J - J) / beta maps x to s. Its inverse is beta (2 w w^T - J).
 
+Where compiled loops are used, one of them takes the same steps (`fused_critical`).
+
 [1] Andersen, Roos and Terlaky, Mathematical Programming 95, 2003.
 """
 
@@ -32,6 +34,7 @@ from torchgrasp.contacts.balance import grasp_map
 from torchgrasp.contacts.form_closure import Vectors, count_contacts, scaled_arms, with_torque
 from torchgrasp.foundation.base import FINGERTIPS, flatnonzero, map_rows, row_numbers
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.fused import is_fused
 from torchgrasp.foundation.rules import ANY, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
@@ -254,6 +257,11 @@ def _search(
     finite = finite.flatten(1).all(1) & torch.isfinite(load).all(1)
     left = flatnonzero(finite & ~degenerate(points))
     axes = torch.stack([-normals, *across(normals)], 2)  # (b, f, 3 axes, 3)
+    if is_fused(points, normals, load):
+        from torchgrasp.contacts import fused_critical  # it imports numba
+
+        good, balances = fused_critical.search(points[left], axes[left], load[left])
+        return left[good], LeastBalance(*(x[good] for x in balances))
     every = _Cones.of(points, axes, load)
     cones = every.some(left)
     at = cones.first()
