@@ -272,7 +272,7 @@ class Withdrawal:
         reference = controller.reference
         palm = controller.targets.palm
         here = torch.zeros(6, dtype=torch.float64)
-        joints = observation.joints
+        joints = observation.joints.clone()  # the robot may read into one buffer
         self.opening = Reopening(reference, here, joints, palm, palm + reference.rise, reach=0.0)
         self.period = period
         self.length = length
@@ -283,9 +283,9 @@ class Withdrawal:
         opening = self.opening
         while not opening.done:
             joints = opening(self.period)
-            yield Targets(joints, opening.palm)
+            yield Targets(joints, opening.palm).copied()
         ticks = max(1, round(REGRASP.withdrawal / self.period))
         for k in range(2 * ticks):
             share, rate = smooth_step(min((k + 1) / ticks, 1.0))
             self.speed = self.length * rate / (ticks * self.period)
-            yield Targets(opening.opened, opening.palm, self.length * share)
+            yield Targets(opening.opened, opening.palm, self.length * share).copied()

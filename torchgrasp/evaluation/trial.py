@@ -298,6 +298,8 @@ def derive_reference(
     table = table and table.moved(inverse(grasp.obj_from_hand[0]))
     sensor = sensor or plan.sensor
     known = {"table": table, "surface": surface, "sensor": sensor, "max_force": max_force}
+    # trials also tell tables that are wrong, and grasps that were moved into another frame
+    known["planned_table"] = None
     return dataclasses.replace(plan, **known)
 
 

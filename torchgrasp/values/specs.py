@@ -364,6 +364,7 @@ class TrialSpec(Value):
     * `options` of a closing that has none;
     * a closing or holding that needs more than the `sensor` measures;
     * the holding "law" after a closing that does not follow Eq. 25;
+    * a `max_force` with a holding that cannot keep it (`check_limit`);
     * a `force` above `max_force`, or a `table_friction` above the least `friction`;
     * a control period below one timestep.
 
@@ -400,6 +401,7 @@ class TrialSpec(Value):
     def __post_init__(self) -> None:
         choose_options(self.closing, self.options)
         check_modes(self.sensor, self.closing, self.pressing)
+        check_limit(self.max_force, self.closing, self.pressing)
         if self.max_force is not None and self.force is not None and self.force > self.max_force:
             raise BadArgument("force", self.force, f"at most max_force, {self.max_force:g}")
         check_within("mass", self.mass, MASSES)
@@ -472,3 +474,16 @@ def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
         raise BadArgument("sensor", poor, allowed.format(f"closing {closing!r}"))
     if not sensor.full and closing != "open_loop" and holding not in ("force", "position"):
         raise BadArgument("sensor", poor, allowed.format(f"holding {holding!r}"))
+
+
+def check_limit(max_force: float | None, closing: str, holding: str) -> None:
+    """Raise `BadArgument` for a largest force [N] that the modes do not keep.
+
+    The springs of "impedance" add to its forces. Positions alone command no force.
+    """
+    if max_force is None or closing == "open_loop":
+        return
+    blind = holding == "position" and closing in ("position", "paper_position")
+    if blind or holding == "impedance":
+        found = f"{max_force:g} N with closing {closing!r} and holding {holding!r}"
+        raise BadArgument("max_force", found, "None, or holding 'grip' or 'force'")
