@@ -220,7 +220,8 @@ def load_arm(
             gets this range.
         hand: the hand on the arm, or its name, or its folder.
         tip: name of the link that carries the hand. None means the link that the most joints move.
-            Of several such links, it means the last one in the file.
+            Of several such links, it means the last one in the file. A robot that branches, as
+            one with fingers or with two arms, needs the name.
         obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the cloud that is
             planned on. None means the identity.
         tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip; None means
@@ -233,6 +234,7 @@ def load_arm(
             `torchgrasp.app.author.clean_arm` replaces meshes.
         HandFileError: a joint between root and tip that mimics another joint.
         BadArgument: no link is named `tip`, fewer than six joints move it, or a pose is not rigid.
+        BadArgument: `tip` is None, and the robot branches.
 
     >>> from torchgrasp import load_hand
     >>> load_arm(load_hand("allegro").urdf_path, "allegro", "thumb_tip")
@@ -244,7 +246,8 @@ def load_arm(
     hand = as_hand(hand, "hand")
     whole = read_published(urdf)
     named = {link.name: link for link in whole.links}
-    tip = max(reversed(named), key=lambda name: len(whole.movers(name))) if tip is None else tip
+    if tip is None:
+        tip = _last_link(whole, [*named])
     if tip not in named or len(whole.movers(tip)) < ARM.joints:
         raise BadArgument("tip", repr(tip), "a link that at least six joints move")
     turn = 2 * math.pi
@@ -305,6 +308,21 @@ def load_arm(
     often = counts.gt(0).float().mean(1)
     # Others touch by construction.
     return dataclasses.replace(arm, pairs=pairs[often[owner] <= ALWAYS])
+
+
+def _last_link(whole: Urdf, names: list[str]) -> str:
+    """Return the link of a robot that the most joints move, of several such links the last one.
+
+    Raises `BadArgument` for a robot with another end: a link that six joints move, of which some do
+    not move the returned link.
+    """
+    moved = {name: set(whole.movers(name)) for name in names}
+    last = max(reversed(names), key=lambda name: len(moved[name]))
+    ends = [x for x in names if len(moved[x]) >= ARM.joints and not moved[x] <= moved[last]]
+    if ends:
+        found = f"None, for a robot that ends in {last!r} and in {ends[-1]!r}"
+        raise BadArgument("tip", found, "the name of the link that carries the hand")
+    return last
 
 
 def _spheres(
