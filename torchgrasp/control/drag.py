@@ -213,6 +213,7 @@ class DragController:
         speed = DRAGGING.gain * (force - self.plan.force)
         return max(-DRAGGING.touching, min(speed, DRAGGING.touching))
 
+
 def _shortened(vector: Float[Tensor, "3"], most: float) -> Float[Tensor, "3"]:
     """Return a vector, shortened to the length `most` if it is longer; both may be 0."""
     length = float(norm(vector))
