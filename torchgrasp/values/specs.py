@@ -364,6 +364,7 @@ class TrialSpec(Value):
     * `options` of a closing that has none;
     * a closing or holding that needs more than the `sensor` measures;
     * the holding "law" after a closing that does not follow Eq. 25;
+    * the holding "grip" or "impedance" after the closing "open_loop";
     * a `max_force` with a holding that cannot keep it (`check_limit`);
     * a `force` above `max_force`, or a `table_friction` above the least `friction`;
     * a control period below one timestep.
@@ -466,6 +467,9 @@ def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
         raise BadArgument(
             "holding", f"'law' after {closing!r}", "another holding, or a closing under Eq. (25)"
         )
+    if closing == "open_loop" and holding in ("grip", "impedance"):
+        found = f"{holding!r} after 'open_loop', which keeps its squeeze"
+        raise BadArgument("holding", found, "None, or another closing")
     poor = f"one of kind {sensor.kind!r}" + (
         f" with {', '.join(sensor.dead)} dead" if sensor.dead else ""
     )
