@@ -192,3 +192,11 @@ def test_what_a_trial_would_ignore_is_refused_or_told(monkeypatch):
     for holding in ("grip", "impedance"):
         with pytest.raises(BadArgument, match=r"holding: .*squeeze"):
             TrialSpec(closing="open_loop", holding=holding)
+
+
+def test_a_control_period_is_a_whole_number_of_timesteps():
+    with pytest.raises(BadArgument, match=r"control_rate: .*250 or 166\.667 Hz, got 200 Hz"):
+        TrialSpec(control_rate=200.0)
+    for rate in (100.0, 1 / 0.006, 500.0, 50.0):
+        TrialSpec(control_rate=rate)
+    TrialSpec(control_rate=200.0, timestep=1 / 1000)

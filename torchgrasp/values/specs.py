@@ -20,6 +20,7 @@ GRAVITY = 9.81
 RIM = 0.001  # radius [m] that is flat on a rim
 PAPER_RADIUS = 0.1  # the paper's radius of starts, normalised
 ROUNDING = 1e-9  # relative error of a period
+UNEVEN = 1e-3  # largest relative error of a period that is no whole number of timesteps
 FRICTIONS = Range(0.0, 10.0)
 """The coefficients of friction that are possible."""
 MASSES = Range(0.001, 10.0)
@@ -367,7 +368,7 @@ class TrialSpec(Value):
     * the holding "grip" or "impedance" after the closing "open_loop";
     * a `max_force` with a holding that cannot keep it (`check_limit`);
     * a `force` above `max_force`, or a `table_friction` above the least `friction`;
-    * a control period below one timestep.
+    * a control period that is no whole number of timesteps.
 
     >>> TrialSpec(mass=0.3).pressing, TrialSpec(force=6.0).pressing
     ('grip', 'force')
@@ -415,6 +416,15 @@ class TrialSpec(Value):
         if not self.control_rate * self.timestep < 1 + ROUNDING:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")
+        steps = 1 / (self.control_rate * self.timestep)
+        whole = max(1, round(steps))
+        if abs(steps / whole - 1) > UNEVEN:
+            found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
+            slower = 1 / ((whole + 1) * self.timestep)
+            near = f"{1 / (whole * self.timestep):g} or {slower:g} Hz"
+            raise BadArgument(
+                "control_rate", found, f"a period of whole timesteps, such as at {near}"
+            )
 
     @property
     def pressing(self) -> HoldingMode:
