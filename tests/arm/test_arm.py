@@ -108,6 +108,10 @@ def test_files_that_are_no_arm_are_refused(hand, tmp_path):
     gripper = good.replace("</robot>", f"{fingers}</robot>")
     with pytest.raises(BadArgument, match=r"tip: .*name of the link.*'right' and in 'left'"):
         load(gripper)
+    mount = torch.eye(4, dtype=torch.float64)
+    mount[2, 3] = 95.0
+    with pytest.raises(BadArgument, match=r"tip_from_hand: .*in metres"):
+        load_arm(tmp_path / "arm.urdf", hand, "tool0", tip_from_hand=mount)
     assert load(gripper, "tool0").joint_names == load(good).joint_names
     with pytest.raises(BadArgument, match=r"tip: .*'hand'"):
         load(good, "hand")

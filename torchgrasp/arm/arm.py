@@ -19,6 +19,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Pose, Seed
 from torchgrasp.geometry.frames import apply, inverse, real
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.hand.collision_shapes import ALWAYS, cover
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, tree_from_urdf
@@ -44,6 +45,8 @@ class ArmNumbers:
     """Edge [m] of a sphere's cell: one sphere fills a section of a thin link."""
     bulge: float = 0.01
     """Distance [m] by which a sphere may protrude from a shape."""
+    mount: float = 1.0
+    """Largest distance [m] of a hand from the arm's tip: a larger one is in millimetres."""
 
 
 ARM = ArmNumbers()
@@ -234,7 +237,7 @@ def load_arm(
             `torchgrasp.app.author.clean_arm` replaces meshes.
         HandFileError: a joint between root and tip that mimics another joint.
         BadArgument: no link is named `tip`, fewer than six joints move it, or a pose is not rigid.
-        BadArgument: `tip` is None, and the robot branches.
+        BadArgument: `tip` is None, and the robot branches; or the hand is over 1 m from the tip.
 
     >>> from torchgrasp import load_hand
     >>> load_arm(load_hand("allegro").urdf_path, "allegro", "thumb_tip")
@@ -279,6 +282,10 @@ def load_arm(
     library = (lower + upper) / 2 + share * reach
     same = torch.eye(4, dtype=torch.float64, device="cpu")
     base, mount = (same if x is None else x.to(same) for x in (obj_from_base, tip_from_hand))
+    away = float(norm(mount[:3, 3]))
+    if away > ARM.mount:
+        found = f"a hand {away:g} m from the tip"
+        raise BadArgument("tip_from_hand", found, f"at most {ARM.mount:g} m, in metres")
     link, center, radius, palm = _spheres(chain, hand.to("cpu", torch.float64), mount)
     above = tree.moves.sum(1).long()[link]  # the number of joints that move each sphere
     moving = flatnonzero((above > 0) & ~palm)
