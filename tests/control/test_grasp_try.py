@@ -131,7 +131,7 @@ def test_rows_that_are_no_grasps_are_refused(tried):
 
 
 def test_no_grasp_is_next_where_none_is_left():
-    with pytest.raises(BadArgument, match="another grasp"):
+    with pytest.raises(BadArgument, match="another one"):
         next_grasp(around(0.0, 10.0), [0])
 
 

@@ -167,9 +167,9 @@ class GraspTry:
     def others(self) -> Int[Tensor, "k"]:
         """The indices (k,) of the grasps that are left to try.
 
-        An executable grasp is left if it differs from each tried grasp. Two grasps differ if their approaches
-        are more than 30 degrees apart (`REGRASP.turn`). They also differ if the mean distance of
-        their contacts is more than 15 mm (`REGRASP.gap`).
+        An executable grasp is left if it differs from each tried grasp. Two grasps differ if their
+        approaches are more than 30 degrees apart (`REGRASP.turn`). They also differ if the mean
+        distance of their contacts is more than 15 mm (`REGRASP.gap`).
         """
         return list_others(self.grasps, self.tried)
 
