@@ -55,7 +55,7 @@ class FakeRobot:
 
 
 hand = load_hand("allegro")
-grasp = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=50)[0]
+grasp = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=50).best
 palm = grasp.obj_from_hand[0].numpy().round(3).tolist()
 print("palm to", palm, "with the joints at the pre-grasp")
 

@@ -5,6 +5,7 @@ kp (target - joint). So a target that is near the joint limits the torque.
 """
 
 import dataclasses
+import math
 import threading
 from typing import NamedTuple, Protocol
 
@@ -51,6 +52,8 @@ class OpenLoopNumbers:
     """Age of a reading [s] that stops the hand."""
     blocked: float = 0.3
     """Distance [rad] of a joint from its target that stops the hand before the squeeze."""
+    far: float = math.pi
+    """Distance [rad] of the first reading from the pre-grasp that no finger has: it is in degrees."""
     period: float = 0.01
     """Time between two ticks [s]."""
 
@@ -120,6 +123,9 @@ def close_open_loop(
         now, before = driver.read()
         if not bool(torch.isfinite(before).all()):
             ended = "stopped at the start: a reading that is no number"
+            return ended
+        if float((before - closing.postures["pregrasp"]).abs().max()) > numbers.far:
+            ended = "stopped at the start: a joint out of its range, as in degrees"
             return ended
         for name, posture in closing.postures.items():
             way = posture - before

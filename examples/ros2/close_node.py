@@ -12,7 +12,7 @@ import dataclasses
 import gc
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ import torch
 
 from torchgrasp import ClosingReference, GraspController, load_grasps
 from torchgrasp.control import ClosingOptions, feel_torques, no_contact, observe
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand import hand_of
 from torchgrasp.values.closing import SensorModel
 
@@ -60,7 +61,7 @@ class HandLoop:
     """
 
     def __init__(self, settings: Settings) -> None:
-        grasp = load_grasps(settings.grasps)[settings.row]
+        grasp = load_grasps(settings.grasps)[settings.row].raise_for_status()
         self.period = 1 / settings.rate
         reference = ClosingReference.from_grasp(
             hand_of(grasp), grasp, settings.force, kp=settings.kp or None
@@ -87,10 +88,21 @@ class HandLoop:
         self.before = self.pregrasp
         self.silent = 0
 
-    def hear(self, positions: Any) -> None:
-        """Take the driver's joint positions [rad], in its order: of a JointState, or of the LEAP's
-        service.
+    def hear(self, positions: Any, names: Sequence[str] = ()) -> None:
+        """Take the driver's joint positions [rad]: of a JointState, or of the LEAP's service.
+
+        They are in the order of `names`, those of the message, which may have further joints.
+        Without names they are in the driver's order. Raises `BadArgument` for a joint that the
+        names lack.
         """
+        if len(names):
+            at = {name: place for place, name in enumerate(names)}
+            if lacking := [name for name in self.names if name not in at]:
+                found = f"joint states without {lacking[0]!r}"
+                raise BadArgument("names", found, f"those of the driver: {', '.join(self.names)}")
+            if len(positions) != len(names):
+                return
+            positions = [positions[at[name]] for name in self.names]
         if len(positions) == len(self.names) and all(map(math.isfinite, positions)):
             first = self.measured is None
             self.silent = 0
@@ -205,7 +217,10 @@ def listen(node: Any, loop: HandLoop) -> Callable[[], None]:
         from sensor_msgs.msg import JointState  # pyright: ignore[reportMissingImports]
 
         node.create_subscription(
-            JointState, loop.driver.states, lambda message: loop.hear(message.position), 1
+            JointState,
+            loop.driver.states,
+            lambda message: loop.hear(message.position, message.name),
+            1,
         )
         return lambda: None
     from leap_hand.srv import LeapPosition  # pyright: ignore[reportMissingImports]

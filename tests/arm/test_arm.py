@@ -98,6 +98,21 @@ def test_files_that_are_no_arm_are_refused(hand, tmp_path):
     assert load(endless).upper.tolist() == load(good).upper.tolist() and endless != good
     with pytest.raises(BadArgument, match=r"tip: .*six joints"):
         load(good, "wrist_2_link")
+    # a gripper whose fingers are no place for a hand
+    fingers = "".join(
+        f'<link name="{x}"/><joint name="slide_{x}" type="prismatic"><parent link="tool0"/>'
+        f'<child link="{x}"/><axis xyz="0 {y} 0"/><limit lower="0" upper="0.04" effort="9" '
+        'velocity="1"/></joint>'
+        for x, y in (("left", 1), ("right", -1))
+    )
+    gripper = good.replace("</robot>", f"{fingers}</robot>")
+    with pytest.raises(BadArgument, match=r"tip: .*name of the link.*'right' and in 'left'"):
+        load(gripper)
+    mount = torch.eye(4, dtype=torch.float64)
+    mount[2, 3] = 95.0
+    with pytest.raises(BadArgument, match=r"tip_from_hand: .*in metres"):
+        load_arm(tmp_path / "arm.urdf", hand, "tool0", tip_from_hand=mount)
+    assert load(gripper, "tool0").joint_names == load(good).joint_names
     with pytest.raises(BadArgument, match=r"tip: .*'hand'"):
         load(good, "hand")
     with pytest.raises(HandFileError, match="elbow_link with a mesh"):

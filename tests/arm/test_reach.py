@@ -180,6 +180,9 @@ def test_a_motion_has_all_joints_and_goes_through_the_grasp(arm, hand, good):
     ):  # it stands elsewhere
         with pytest.raises(BadArgument, match=r"grasps: .*posture of this arm"):
             plan_motion(other, hand, good[:1])
+    far = dataclasses.replace(good[:1], approach=20.0 * good.approach[:1])  # from 2 m away
+    with pytest.raises(BadArgument, match=r"grasps: .*cannot follow"):
+        plan_motion(arm, hand, far)
     again = plan_motion(arm.to(torch.float32), hand, good[:3].to(torch.float32))
     assert torch.allclose(again.positions, motion.positions, atol=1e-3)
 

@@ -18,7 +18,7 @@ from torchgrasp.campaign import job as job_module
 from torchgrasp.data import GraspShards, read_shards, read_view
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec, evaluate
 from torchgrasp.evaluation.views import ObjectView
-from torchgrasp.foundation.errors import BadArgument, DatasetError
+from torchgrasp.foundation.errors import BadArgument, DatasetError, OutputError
 
 
 @pytest.mark.sim
@@ -170,6 +170,22 @@ def test_bad_arguments_are_named_before_any_work(carton: Path, tmp_path: Path, c
         assert cli.main([*words, *more]) == 2
         assert capsys.readouterr().err.startswith(f"torchgrasp: {named}: expected "), more
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.sim
+def test_a_mesh_or_a_cloud_that_changed_is_another_campaign(
+    data: Path, carton: Path, tmp_path: Path
+):
+    finished = tmp_path / "data"
+    shutil.copytree(data, finished)
+    for file in ("mesh.ply", "view0_noisy.ply"):
+        changed = tmp_path / file
+        shutil.copytree(carton, changed)
+        run_campaign(changed, load_hand("barrett"), finished, QUICK)  # nothing is left to do
+        path = changed / "carton" / file
+        path.write_bytes(path.read_bytes()[:-12] + bytes(12))
+        with pytest.raises(OutputError, match="other campaigns"):
+            run_campaign(changed, load_hand("barrett"), finished, QUICK)
 
 
 def test_other_versions_and_hands_on_a_machine_end_the_campaign(carton: Path):

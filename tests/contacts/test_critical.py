@@ -65,6 +65,8 @@ def test_contacts_without_a_balance_are_infinite_and_other_numbers_are_refused()
     assert alone.item() == pytest.approx(found[3].item(), abs=1e-4)
     with pytest.raises(BadArgument, match="3 to 5 contacts"):
         critical_friction(points[:, :2], normals[:, :2])
+    with pytest.raises(BadArgument, match=r"normals: .*unit"):
+        critical_friction(points[3], 2.0 * normals[3])
     for count in (2, 6):
         same = points[3, :1].expand(count, 3)
         with pytest.raises(BadArgument, match="3 to 5 contacts"):

@@ -340,6 +340,9 @@ def test_wrong_arguments_are_refused():
     for argument, arguments in wrong:
         with pytest.raises(BadArgument, match=argument):
             hold_probability(*arguments)
+    in_mm = CarriedWeight(0.1, 1000.0 * contacts.points[0].mean(0) + 50.0, press=5.0)
+    with pytest.raises(BadArgument, match=r"weight\.center: .*metres"):
+        hold_probability(contacts, 0.5, weight=in_mm)
     for argument, arguments in (
         ("mass", (Distribution.between(0.0, 0.1), torch.zeros(3), 5.0)),
         ("press", (0.1, torch.zeros(3), 0.0)),

@@ -14,10 +14,12 @@ from tests.point_fingers import (
     TARGET,
     TOUCHING,
     observation,
+    on_table,
     real,
     reference,
 )
-from torchgrasp import TrialSpec
+from torchgrasp import Plane, TrialSpec, load_hand
+from torchgrasp.control import no_contact, observe
 from torchgrasp.control.controller import CLOSING_TIME, GraspController
 from torchgrasp.control.finger_forces import desired_forces
 from torchgrasp.control.holding import RAMP, ForceHold, GripHold, held_forces
@@ -25,6 +27,7 @@ from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.control.recovery import PRESSING_TIME
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import fibonacci_sphere
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.values.closing import ClosingOptions
 
 PRESSED = (2.0, 2.0, 4.0)
@@ -35,6 +38,14 @@ CLOSE = TARGET * real(
 
 def run(controller, seen, seconds):
     return [controller.step(seen, PERIOD).joints for _ in range(round(seconds / PERIOD))]
+
+
+def sphere_field(away: float) -> SignedDistanceField:
+    """The distances [m] of a ball of 3 cm, `away` [m] from the contacts."""
+    axis = torch.linspace(-0.05, 0.05, 11).double()
+    nodes = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    corner = real([away - 0.05, -0.05, -0.05])
+    return SignedDistanceField(corner, 0.01, nodes.norm(dim=-1) - 0.03)
 
 
 def off(forces: torch.Tensor, proportions: torch.Tensor) -> float:
@@ -177,3 +188,57 @@ def test_options_of_closings_without_any_and_components_without_those_they_need_
     for options in ({"pose_estimate": False}, {"palm_reach": 0.0}, {"attempts": 0}, {"stops": -1}):
         with pytest.raises(BadArgument):
             ClosingOptions(**options)
+
+
+@pytest.mark.parametrize("holding", ["force", "grip", "position", "law"])
+def test_a_robot_may_change_targets_and_reuse_the_memory_of_its_readings(holding):
+    ours = GraspController(reference(), holding=holding)
+    theirs = GraspController(reference(), holding=holding)
+    memory = observation(contact=TOUCHING, reading=PRESSED)
+    for k in range(200):
+        joints = torch.full((9,), 1e-4 * k).double()
+        seen = dataclasses.replace(observation(contact=TOUCHING, reading=PRESSED), joints=joints)
+        memory.joints.copy_(joints)
+        sent = theirs.step(memory, PERIOD)
+        assert torch.equal(ours.step(seen, PERIOD).joints, sent.joints)
+        sent.joints.mul_(180 / torch.pi)  # a driver in degrees
+        sent.palm.add_(1.0)
+    assert torch.equal(ours.targets.joints, theirs.targets.joints)
+
+
+def test_parts_of_a_plan_that_do_not_fit_each_other_are_refused_by_name():
+    known = on_table(planned_table=on_table().table)
+    GraspController(known)
+    up = known.table.normal
+    tilted = Plane(real([0.0, 0.0, 1.0]), known.table.offset)
+    wrong = {
+        "table": [tilted, Plane(up, known.table.offset - 0.1), Plane(-up, 0.1)],
+        "surface": [sphere_field(away=0.3)],
+        "normals": [2.0 * NORMALS],
+        "approach": [real([0.0, -100.0, 0.0])],
+        "kp": [known.kp[:5], 0.0 * known.kp],
+    }
+    for name, values in wrong.items():
+        for value in values:
+            with pytest.raises(BadArgument, match=name):
+                GraspController(dataclasses.replace(known, **{name: value}))
+
+
+def test_a_largest_force_that_the_modes_do_not_keep_is_refused():
+    fragile = dataclasses.replace(reference(), max_force=2.0)
+    GraspController(dataclasses.replace(fragile, max_force=4.0), holding="law")
+    for closing, holding in (("open_loop", "force"), ("paper", "force"), ("uncertainty", "law")):
+        with pytest.raises(BadArgument, match="max_force"):
+            GraspController(fragile, closing, holding)
+    for closing, holding in (("uncertainty", "impedance"), ("position", "position")):
+        with pytest.raises(BadArgument, match="max_force"):
+            TrialSpec(closing=closing, holding=holding, max_force=2.0)
+
+
+def test_measured_joints_in_degrees_are_refused_and_overshoot_is_not():
+    hand = load_hand("barrett")
+    middle = (hand.lower + hand.upper) / 2
+    observe(hand, hand.upper + 0.1, no_contact())
+    with pytest.raises(BadArgument, match="radians"):
+        observe(hand, middle * 180 / torch.pi, no_contact())
+    observe(hand, middle, no_contact())

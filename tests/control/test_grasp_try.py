@@ -131,7 +131,7 @@ def test_rows_that_are_no_grasps_are_refused(tried):
 
 
 def test_no_grasp_is_next_where_none_is_left():
-    with pytest.raises(BadArgument, match="another grasp"):
+    with pytest.raises(BadArgument, match="another one"):
         next_grasp(around(0.0, 10.0), [0])
 
 
@@ -171,3 +171,14 @@ def test_the_next_try_knows_what_a_load_that_is_too_heavy_shows_of_the_mass():
     known = Distribution.parse(attempt.next().grasps.meta["mass"])
     assert known == attempt.controller.mass
     assert 0.3 < known.least < 1.0 < known.most
+
+
+def test_grasps_that_failed_a_check_are_not_tried():
+    grasps = around(0.0, 40.0, 80.0)
+    failed = torch.tensor([Status.OK, Status.NOT_CLOSED, Status.OK]).to(grasps.status)
+    grasps = dataclasses.replace(grasps, status=failed)
+    attempt = GraspTry(grasps, start)
+    assert attempt.others.tolist() == [2] and next_grasp(grasps, [0]) == 2
+    assert GraspTry(grasps, start, tried=(0, 2)).next() is None
+    with pytest.raises(BadArgument, match=r"tried: .*executable"):
+        GraspTry(grasps, start, tried=(1,))

@@ -24,11 +24,12 @@ from tests.point_fingers import (
     real,
     reference,
 )
-from torchgrasp import Status
+from torchgrasp import GraspController, Status
 from torchgrasp.control.held_object import FRICTION, FrictionEstimate, LoadEstimate, likely_body
 from torchgrasp.control.holding import PUSH, RAMP, GripHold, push_reserve
 from torchgrasp.control.least_forces import LeastForces, _Barrier, balance, friction_ratios
 from torchgrasp.control.tactile import TACTILE, Observation
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.values.distribution import Distribution
@@ -477,3 +478,28 @@ def test_the_interval_of_the_mass_holds_it_in_nineteen_of_twenty_lifts(weight):
         assert estimate.mass is not None
         found += estimate.mass.least < weight / 9.81 < estimate.mass.most
     assert 0.92 < found / 400 < 0.98
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_hand_that_turns_with_its_object_carries_the_same_load_if_it_is_told_where_up_is(told):
+    """The wrist turns by 90 degrees about the hand's x axis, in a second."""
+    weight = 6.0
+    hold = strong_hold()
+    seen = observation(0.0, (8.0, 8.0, 16.0), TOUCHING)
+    ups = []
+    for k in range(600):
+        angle = math.pi / 2 * min(max((k - 300) * PERIOD, 0.0), 1.0)
+        ups.append(real([0.0, math.cos(angle), math.sin(angle)]))
+        forces = GAINS.desired_force.numpy() * 4.0
+        push = -(forces * OUTWARD).sum(-1)
+        forces = forces + weight * ups[-1].numpy() * (push / push.sum())[:, None]
+        tactile = dataclasses.replace(seen.tactile, forces=torch.from_numpy(forces))
+        hold(dataclasses.replace(seen, tactile=tactile, up=ups[-1] if told else None), PERIOD)
+    assert (hold.weight == pytest.approx(weight, rel=0.02)) == told
+    assert told == (hold.mass is not None and hold.mass.least < weight / 9.81 < hold.mass.most)
+
+
+def test_up_is_a_unit_vector():
+    gravity = dataclasses.replace(observation(), up=real([0.0, 0.0, 9.81]))
+    with pytest.raises(BadArgument, match="up: "):
+        GraspController(reference()).step(gravity, PERIOD)

@@ -170,6 +170,14 @@ def test_a_first_reading_that_is_no_number_moves_nothing(mock):
     assert (len(driver.torques), driver.stops) == (0, 1)
 
 
+def test_readings_in_degrees_move_nothing(mock):
+    closing = closing_of()
+    driver = mock(closing)
+    driver.joints = closing.postures["grasp"] * 180 / torch.pi
+    assert "degrees" in close_open_loop(driver, closing, threading.Event())
+    assert not driver.torques and driver.stops == 1
+
+
 def test_a_finger_that_meets_something_before_the_grasp_stops_the_hand(mock):
     closing = closing_of()
     driver = mock(closing)

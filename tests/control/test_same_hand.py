@@ -1,5 +1,6 @@
 """Grasps are closed by the hand of their plan: a hand of another geometry is refused."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 
@@ -48,3 +49,18 @@ def test_another_stiffness_and_a_change_below_the_bound_are_no_other_geometry(tm
         assert hand.source.sha256 != grasp.meta["hand_sha256"]
         reference = ClosingReference.from_grasp(hand, grasp)
         assert torch.equal(reference.joints, grasp.joints[0].double())
+
+
+@pytest.mark.parametrize("use", [squeeze, ClosingReference.from_grasp])
+def test_contacts_that_fit_no_fingertip_are_refused(grasp, use):
+    hand = load_hand("allegro")
+    contacts = grasp.contacts
+    wrong = {
+        "normals: .* outward": {"normals": -contacts.normals},
+        "normals: .* unit": {"normals": 2.0 * contacts.normals},
+        "contacts": {"points": 1000.0 * contacts.points},
+    }
+    for match, change in wrong.items():
+        changed_contacts = dataclasses.replace(contacts, **change)
+        with pytest.raises(BadArgument, match=match):
+            use(hand, dataclasses.replace(grasp, contacts=changed_contacts))

@@ -27,8 +27,11 @@ from torchgrasp.evaluation.protocols import (
     find_protocol,
     seed_of,
 )
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth
+from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.specs import TrialSpec
 
@@ -169,3 +172,31 @@ def test_a_protocol_plans_for_the_distributions_that_its_trials_draw_from():
     assert find_protocol("multidex").task.mass == 0.1 * 0.5 / 10.0
     with pytest.raises(BadArgument, match="at most friction"):
         TrialSpec(friction=Distribution.between(0.3, 0.8), table_friction=0.4)
+
+
+def test_what_a_trial_would_ignore_is_refused_or_told(monkeypatch):
+    monkeypatch.setattr(TrialDriver, "_scene_spec", lambda *given: None)  # the scene is not built
+    hand, grasp = pinch("allegro")
+    mesh = cylinder()
+    still = Truth(mesh, [mesh])
+    slides = dataclasses.replace(still, slide=real([0.01, 0.0, 0.0]))
+    TrialDriver(GraspTrial(hand, grasp, slides), TrialSpec())
+    with pytest.raises(BadArgument, match=r"slide: .*approach"):
+        TrialDriver(GraspTrial(hand, grasp, slides), TrialSpec(approach=0.0))
+    told = Plane.horizontal(0.0)
+    with pytest.raises(BadArgument, match="told: "):
+        TrialDriver(GraspTrial(hand, grasp, still, told=told), TrialSpec(table=False))
+    ball = SignedDistanceField(real([0.0, 0.0, 0.0]), 0.1, torch.ones(2, 2, 2).double())
+    with pytest.warns(NoEffect, match="surface"):
+        TrialDriver(GraspTrial(hand, grasp, still, surface=ball), TrialSpec(closing="open_loop"))
+    for holding in ("grip", "impedance"):
+        with pytest.raises(BadArgument, match=r"holding: .*squeeze"):
+            TrialSpec(closing="open_loop", holding=holding)
+
+
+def test_a_control_period_is_a_whole_number_of_timesteps():
+    with pytest.raises(BadArgument, match=r"control_rate: .*250 or 166\.667 Hz, got 200 Hz"):
+        TrialSpec(control_rate=200.0)
+    for rate in (100.0, 1 / 0.006, 500.0, 50.0):
+        TrialSpec(control_rate=rate)
+    TrialSpec(control_rate=200.0, timestep=1 / 1000)

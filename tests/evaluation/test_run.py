@@ -4,6 +4,8 @@ work.
 
 import dataclasses
 import json
+import os
+import shutil
 import time
 from pathlib import Path
 
@@ -340,3 +342,44 @@ def test_a_protocol_of_several_tries_has_the_other_grasps_of_the_view(
     view = views.ObjectView(folder, "tin", "view0", hand.source)
     views.try_grasp(view, grasps, protocol, EvaluationSpec(1), (1, 0))
     assert tried[0].score.tolist() == pytest.approx([0.2, 0.3, 0.1][:count])
+
+
+def test_objects_of_the_household_protocol_have_the_masses_of_the_manifest(
+    folder, tmp_path, monkeypatch
+):
+    """A mass that the user asks for replaces them, and the density of another protocol."""
+    tried = []
+
+    def run(trial, protocol, *at):
+        tried.append(protocol.trial)
+        return GOOD
+
+    monkeypatch.setattr(views, "run_protocol", run)
+    shutil.copytree(folder, tmp_path / "objects")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["objects"]["tin"]["mass_kg"] = 0.7
+    (tmp_path / "objects" / "manifest.json").write_text(json.dumps(manifest))
+    hand = load_hand("allegro")
+    grasp = load_shipped_grasp("jug", "allegro")
+    view = views.ObjectView(tmp_path / "objects", "tin", "view0", hand.source)
+    household = PROTOCOLS["household"]
+    asked = (household, household.with_trial(mass=0.2), PROTOCOLS["tabletop"])
+    for protocol in asked:
+        protocol = protocol.with_trial(closing="open_loop")  # which needs no surface
+        views.try_grasp(view, grasp, protocol, EvaluationSpec(1), (0, 0))
+    assert [trial.mass for trial in tried] == [0.7, 0.2, 0.1]
+    assert PROTOCOLS["multidex"].with_trial(mass=0.2).trial.density is None
+    assert PROTOCOLS["multidex"].with_trial(friction=0.2).trial.density == 500.0
+
+
+def test_a_mesh_that_changes_between_two_calls_is_read_again(folder, tmp_path):
+    objects = tmp_path / "objects"
+    shutil.copytree(folder, objects)
+    before, _ = views._read_solid(objects, "tin")
+    again, _ = views._read_solid(objects, "tin")
+    assert again is before
+    wider = before.copy().apply_scale([1.1, 1.1, 1.0])
+    wider.export(objects / "tin" / "mesh.ply")
+    os.utime(objects / "tin" / "mesh.ply", (1e9, 1e9))
+    after, _ = views._read_solid(objects, "tin")
+    assert after.volume > 1.2 * before.volume

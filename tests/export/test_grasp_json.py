@@ -15,6 +15,7 @@ from tests.pinch import pinch
 from torchgrasp import Plane, load_hand
 from torchgrasp.app import cli
 from torchgrasp.control.finger_forces import squeeze
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, format_isaac, format_keyframes, format_moveit
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
@@ -145,3 +146,19 @@ def test_the_command_writes_both_names_what_is_wrong_and_no_grasps_are_an_empty_
     grasp = pinch("allegro")[1][torch.zeros(0, dtype=torch.int64)]
     assert json.loads(format_grasps(hand, grasp))["grasps"] == []
     assert "<key " not in format_keyframes(hand, grasp)
+
+
+@pytest.mark.parametrize("write", [format_grasps, format_isaac, format_moveit])
+def test_a_flange_in_millimetres_and_grasps_in_degrees_are_refused(write):
+    hand = load_hand("barrett")
+    grasp = load_shipped_grasp("jug", "barrett")
+    flange = torch.eye(4, dtype=torch.float64)
+    flange[2, 3] = 95.0
+    with pytest.raises(BadArgument, match=r"flange: .*in metres"):
+        write(hand, grasp, flange=flange)
+    degrees = dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 180 / torch.pi)
+    with pytest.raises(BadArgument, match=r"grasps.pregrasp: "):
+        write(hand, degrees)
+    longer = dataclasses.replace(grasp, approach=2.0 * grasp.approach)
+    with pytest.raises(BadArgument, match=r"grasps.approach: .*unit"):
+        write(hand, longer)

@@ -144,9 +144,8 @@ def test_moveit_gets_postures_pose_approach_and_quality(name):
 
 def test_every_number_of_the_yaml_is_a_number_and_graspgen_finds_transforms_and_mask():
     hand, grasp = pinch("allegro")
-    tiny = dataclasses.replace(
-        grasp, pregrasp=torch.full_like(grasp.pregrasp, 1e-12), score=torch.tensor([-40.0])
-    )
+    opened = torch.full_like(grasp.pregrasp, 1e-12).clamp(hand.lower, hand.upper)
+    tiny = dataclasses.replace(grasp, pregrasp=opened, score=torch.tensor([-40.0]))
     (message,) = yaml.safe_load(format_moveit(hand, tiny))
     assert all(isinstance(x, float) for x in message["pre_grasp_posture"]["points"][0]["positions"])
     assert message["grasp_quality"] == 0.0

@@ -303,7 +303,10 @@ def test_a_hand_that_goes_down_while_it_closes_is_left_out_and_told(tmp_path, ca
     both = grasp[[0, 0]]
     poses = torch.cat([grasp.obj_from_hand, higher])
     meta = grasp.meta | {"table": table.describe()}
-    both = dataclasses.replace(both, obj_from_hand=poses, meta=meta)
+    points = both.contacts.points.clone()
+    points[1, :, 2] += 0.02
+    contacts = dataclasses.replace(both.contacts, points=points)
+    both = dataclasses.replace(both, obj_from_hand=poses, contacts=contacts, meta=meta)
     both.save(tmp_path / "g.safetensors")
     for kind in ("isaac", "moveit"):
         out = tmp_path / f"{kind}.yaml"

@@ -12,6 +12,7 @@ from tests.ros2 import bags
 from torchgrasp.control import Targets
 from torchgrasp.evaluation import lift
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth
+from torchgrasp.foundation.errors import BadArgument, FailedRows, Status
 from torchgrasp.values.specs import TrialSpec
 
 
@@ -131,6 +132,20 @@ def test_a_driver_that_falls_silent_or_says_nonsense_gets_no_commands(file):
     assert heard == [True] * 20 + [False] * 10  # 0.1 s at 200 Hz
 
 
+def test_joint_states_in_another_order_are_read_by_their_names(file):
+    loop = close_node.HandLoop(close_node.Settings(file))
+    other = sorted(["wrist", *loop.names])
+    loop.hear([0.01 * k for k in range(len(other))], other)
+    place = {name: 0.01 * k for k, name in enumerate(other)}
+    expected = [place[loop.names[k]] for k in loop.back]
+    assert loop.measured.tolist() == pytest.approx(expected)
+    before = loop.measured
+    loop.hear([0.0] * 3, other)  # a message that is cut off
+    assert loop.measured is before
+    with pytest.raises(BadArgument, match="names"):
+        loop.hear([0.0] * 16, ["joint_0.0", *map(str, range(15))])
+
+
 def test_the_leap_gets_motors_in_its_order_about_a_half_turn(tmp_path):
     """The LEAP's driver has motors 0 to 15, and calls a flat finger 180 degrees."""
     from torchgrasp import load_hand
@@ -139,7 +154,12 @@ def test_the_leap_gets_motors_in_its_order_about_a_half_turn(tmp_path):
     hand = load_hand("leap")
     middle = ((hand.lower + hand.upper) / 2).double()[None]
     pose = torch.eye(4, dtype=torch.float64)[None]
-    grasps_from_joints(hand, middle, pose, std_m=0.003).save(tmp_path / "leap.safetensors")
+    grasp = grasps_from_joints(hand, middle, pose, std_m=0.003)
+    grasp.save(tmp_path / "leap.safetensors")
+    with pytest.raises(FailedRows):  # no grasp at all
+        close_node.HandLoop(close_node.Settings(str(tmp_path / "leap.safetensors")))
+    passed = torch.zeros_like(grasp.status) + int(Status.OK)
+    dataclasses.replace(grasp, status=passed).save(tmp_path / "leap.safetensors")
     loop = close_node.HandLoop(close_node.Settings(str(tmp_path / "leap.safetensors")))
     order = [hand.tree.joint_names.index(str(k)) for k in range(16)]
     driver = Driver(loop, order, np.pi, [str(k) for k in range(16)])

@@ -19,6 +19,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Pose, Seed
 from torchgrasp.geometry.frames import apply, inverse, real
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.hand.collision_shapes import ALWAYS, cover
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, tree_from_urdf
@@ -44,6 +45,8 @@ class ArmNumbers:
     """Edge [m] of a sphere's cell: one sphere fills a section of a thin link."""
     bulge: float = 0.01
     """Distance [m] by which a sphere may protrude from a shape."""
+    mount: float = 1.0
+    """Largest distance [m] of a hand from the arm's tip: a larger one is in millimetres."""
 
 
 ARM = ArmNumbers()
@@ -220,7 +223,8 @@ def load_arm(
             gets this range.
         hand: the hand on the arm, or its name, or its folder.
         tip: name of the link that carries the hand. None means the link that the most joints move.
-            Of several such links, it means the last one in the file.
+            Of several such links, it means the last one in the file. A robot that branches, as
+            one with fingers or with two arms, needs the name.
         obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the cloud that is
             planned on. None means the identity.
         tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip; None means
@@ -233,6 +237,7 @@ def load_arm(
             `torchgrasp.app.author.clean_arm` replaces meshes.
         HandFileError: a joint between root and tip that mimics another joint.
         BadArgument: no link is named `tip`, fewer than six joints move it, or a pose is not rigid.
+        BadArgument: `tip` is None, and the robot branches; or the hand is over 1 m from the tip.
 
     >>> from torchgrasp import load_hand
     >>> load_arm(load_hand("allegro").urdf_path, "allegro", "thumb_tip")
@@ -244,7 +249,8 @@ def load_arm(
     hand = as_hand(hand, "hand")
     whole = read_published(urdf)
     named = {link.name: link for link in whole.links}
-    tip = max(reversed(named), key=lambda name: len(whole.movers(name))) if tip is None else tip
+    if tip is None:
+        tip = _last_link(whole, [*named])
     if tip not in named or len(whole.movers(tip)) < ARM.joints:
         raise BadArgument("tip", repr(tip), "a link that at least six joints move")
     turn = 2 * math.pi
@@ -276,6 +282,10 @@ def load_arm(
     library = (lower + upper) / 2 + share * reach
     same = torch.eye(4, dtype=torch.float64, device="cpu")
     base, mount = (same if x is None else x.to(same) for x in (obj_from_base, tip_from_hand))
+    away = float(norm(mount[:3, 3]))
+    if away > ARM.mount:
+        found = f"a hand {away:g} m from the tip"
+        raise BadArgument("tip_from_hand", found, f"at most {ARM.mount:g} m, in metres")
     link, center, radius, palm = _spheres(chain, hand.to("cpu", torch.float64), mount)
     above = tree.moves.sum(1).long()[link]  # the number of joints that move each sphere
     moving = flatnonzero((above > 0) & ~palm)
@@ -305,6 +315,21 @@ def load_arm(
     often = counts.gt(0).float().mean(1)
     # Others touch by construction.
     return dataclasses.replace(arm, pairs=pairs[often[owner] <= ALWAYS])
+
+
+def _last_link(whole: Urdf, names: list[str]) -> str:
+    """Return the link of a robot that the most joints move, of several such links the last one.
+
+    Raises `BadArgument` for a robot with another end: a link that six joints move, of which some do
+    not move the returned link.
+    """
+    moved = {name: set(whole.movers(name)) for name in names}
+    last = max(reversed(names), key=lambda name: len(moved[name]))
+    ends = [x for x in names if len(moved[x]) >= ARM.joints and not moved[x] <= moved[last]]
+    if ends:
+        found = f"None, for a robot that ends in {last!r} and in {ends[-1]!r}"
+        raise BadArgument("tip", found, "the name of the link that carries the hand")
+    return last
 
 
 def _spheres(

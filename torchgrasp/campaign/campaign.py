@@ -4,6 +4,7 @@ A job plans and tries the grasps of one view of one object.
 """
 
 import dataclasses
+import hashlib
 import itertools
 from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from torchgrasp.data.shards import JobRow, shard_ranges, short
 from torchgrasp.evaluation.protocols import Protocol, find_protocol
 from torchgrasp.evaluation.sweep import PLAN_LIMIT, TRIAL_LIMIT
 from torchgrasp.evaluation.views import EvaluationSpec, ObjectView
-from torchgrasp.files import sha256
+from torchgrasp.files import format_json, sha256
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, DatasetError, Status
@@ -122,8 +123,8 @@ def run_campaign(
         BadArgument: an unknown protocol, or no Dask scheduler at the address `workers`.
         BadArgument: `spec.device` is "cuda", but `workers` is not the address of a Dask scheduler.
         BadArgument: a machine of the cluster has other versions or another hand.
-        OutputError: the folder holds another campaign or other files, another run uses it, or it
-            cannot be written.
+        OutputError: the folder holds another campaign, such as one of other meshes or clouds, or
+            other files; another run uses it, or it cannot be written.
         MissingExtra: the simulator, pebble for workers, or Dask for a cluster is not installed.
 
     >>> import tempfile, trimesh
@@ -144,7 +145,7 @@ def run_campaign(
     place = Path(objects).resolve()
     test = spec.test
     rows = _list_jobs(place, spec)
-    asked = _request(place, hand, spec)
+    asked = _request(place, rows, hand, spec)
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, hand, test.noise.draws))
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     views = [ObjectView(place, row.object, row.view, source) for row in rows]
@@ -170,7 +171,9 @@ def run_campaign(
     return carry_out(campaign, Path(folder), work, observer)
 
 
-def _request(objects: Path, hand: Hand, spec: CampaignSpec) -> dict[str, Any]:
+def _request(
+    objects: Path, rows: Sequence[JobRow], hand: Hand, spec: CampaignSpec
+) -> dict[str, Any]:
     """Return the request of a campaign, the content of `campaign.json`."""
     of_hand = {
         "name": hand.name,
@@ -183,7 +186,7 @@ def _request(objects: Path, hand: Hand, spec: CampaignSpec) -> dict[str, Any]:
         "torchgrasp": "campaign",
         "version": 1,
         "licence": spec.licence,
-        "objects_sha256": sha256(objects / "manifest.json"),
+        "objects_sha256": _digest(objects, rows),
         "hand": of_hand,
         "protocol": dataclasses.asdict(spec.test),
         "trials": dataclasses.asdict(spec.trials),
@@ -191,6 +194,19 @@ def _request(objects: Path, hand: Hand, spec: CampaignSpec) -> dict[str, Any]:
         "versions": versions(),
         "device": spec.device,
     }
+
+
+def _digest(objects: Path, rows: Sequence[JobRow]) -> str:
+    """Return the SHA-256 of the manifest, meshes and clouds of all jobs: other files are another
+    campaign.
+    """
+    names = ["manifest.json"]
+    for row in rows:
+        if row.status is Status.OK:
+            names += [f"{row.object}/mesh.ply", f"{row.object}/{row.view}_noisy.ply"]
+    paths = {name: objects / name for name in dict.fromkeys(names)}
+    found = {name: sha256(x) if x.is_file() else "missing" for name, x in paths.items()}
+    return hashlib.sha256(format_json(found).encode()).hexdigest()
 
 
 def _list_jobs(objects: Path, spec: CampaignSpec) -> tuple[JobRow, ...]:

@@ -31,6 +31,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.contacts.balance import grasp_map
+from torchgrasp.contacts.certify import check_unit
 from torchgrasp.contacts.form_closure import Vectors, count_contacts, scaled_arms, with_torque
 from torchgrasp.foundation.base import FINGERTIPS, flatnonzero, map_rows, row_numbers
 from torchgrasp.foundation.checks import checked
@@ -137,7 +138,8 @@ def critical_friction(
         points: positions (*b, f, 3) [m] of the f contacts of each set, 3 to 5.
         normals: outward unit normals (*b, f, 3) of the object, in the same frame.
 
-    Raises `BadArgument` for another number of contacts, or tensors of different shapes.
+    Raises `BadArgument` for another number of contacts, tensors of different shapes, or normals
+    that are not of length 1 (to 1e-3).
 
     >>> points = torch.tensor([[0.0, 1, 0], [0, 0, 0], [1, 0.5, 0]])
     >>> normals = torch.tensor([[-1.0, 0, 0], [-1, 0, 0], [0.8, 0, 0.6]])
@@ -146,7 +148,7 @@ def critical_friction(
     """
     f = count_contacts(points)
     flat = points.reshape(-1, f, 3).double()
-    rows, found = least_balance(flat, normals.reshape(-1, f, 3).double())
+    rows, found = least_balance(flat, check_unit(normals.reshape(-1, f, 3).double()))
     needed = torch.where(found.friction.isnan(), torch.inf, found.friction)
     friction = flat.new_full((len(flat),), torch.inf).index_put((rows,), needed)
     return friction.to(points).reshape(points.shape[:-2])

@@ -76,6 +76,8 @@ class HoldProbabilityNumbers:
     """
     parts: int = 2**20
     """Pairs of a contact set and a part of the distribution that are computed at a time."""
+    farthest: float = 2.0
+    """Largest distance [m] of a centre of mass from the contacts: no hand carries larger things."""
     masses: int = 9
     """Number of ranges of an uncertain mass, in each of which the critical friction is linear."""
 
@@ -360,11 +362,18 @@ def _force(weight: CarriedWeight, mass: float, like: Tensor) -> Float[Tensor, "3
 
 def _center(weight: CarriedWeight, points: Vectors) -> Float[Tensor, "b 3"]:
     """Return the centre of mass [m] of each contact set; raise `BadArgument` if there is not one
-    for each.
+    for each, or if it is far from them.
     """
     if weight.center.ndim == 2:
         check_tensor("weight.center", weight.center, (len(points), 3))
-    return weight.center.to(points).expand(len(points), 3)
+    center = weight.center.to(points).expand(len(points), 3)
+    if is_known(center) and is_known(points):
+        away = norm((center - points.mean(1)).detach())
+        if bool((away > HOLD.farthest).any()):
+            found = f"a centre {float(away.max()):.3g} m off the contacts"
+            allowed = f"one within {HOLD.farthest:g} m, in metres and in the frame of the contacts"
+            raise BadArgument("weight.center", found, allowed)
+    return center
 
 
 def _tilts(tilt: float | Tensor, points: Vectors) -> Float[Tensor, "b f"]:

@@ -23,19 +23,28 @@ from torchgrasp.control.recovery import (
     Reopening,
     can_guard,
 )
-from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.reference import ClosingReference, check_plan
 from torchgrasp.control.relook import relocate
 from torchgrasp.control.tactile import EARLY, STILL, Observation, Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing
-from torchgrasp.foundation.base import check_device, settle
+from torchgrasp.foundation.base import check_device, map_tensors, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector, turned_about
+from torchgrasp.geometry.linalg import dot, norm
+from torchgrasp.geometry.plane import UNIT_ERROR
 from torchgrasp.values.closing import ClosingOptions, choose_options
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import PointCloud
-from torchgrasp.values.specs import ClosingMode, HoldingMode, check_modes, default_holding
+from torchgrasp.values.specs import (
+    ROUNDING,
+    ClosingMode,
+    HoldingMode,
+    check_limit,
+    check_modes,
+    default_holding,
+)
 
 Period = Annotated[float, Range(1e-5, 1.0)]
 # longest time [s] of closing before the hand presses with the contacts that it has
@@ -69,7 +78,6 @@ class GraspController:
 
     Attributes:
         reference: the closing plan, moved by `relook` to the object as a new view showed it.
-        targets: the present `Targets`, which the last `step` returned.
         attempts: number of closings so far, with the present one.
         stops: how often the approach stopped at an unexpected touch.
 
@@ -81,7 +89,10 @@ class GraspController:
     * "impedance" for more than three fingertips;
     * modes that need more than the sensor measures, or a sensor that names an unknown finger;
     * an approach whose options allow no stops;
-    * an approach whose plan lacks a direction, a table, a surface or tactile fingertips.
+    * an approach whose plan lacks a direction, a table, a surface or tactile fingertips;
+    * a `max_force` of the plan that the modes do not keep;
+    * a plan whose parts do not fit: a table or a surface in another frame, normals or an approach
+      that are no unit vectors, a number of drives that is not the hand's.
     """
 
     @checked
@@ -96,6 +107,9 @@ class GraspController:
         self.options = choose_options(closing, options)
         holding = holding or default_holding(reference.sensor, closing)
         check_modes(reference.sensor, closing, holding)
+        check_limit(reference.max_force, closing, holding)
+        check_plan(reference)
+        self._check_force(reference, closing, holding)
         if approach and not (self.options.stops and can_guard(reference)):
             lacking = "stops, or without a table, a surface and a direction in the reference"
             raise BadArgument("approach", approach, f"0 without {lacking}")
@@ -104,6 +118,24 @@ class GraspController:
         self.path = STILL  # displacement [m] of the palm's path by a new view
         self.planned = settle(reference, torch.device("cpu"))
         self._prepare(self.planned, approach)
+
+    def _check_force(
+        self, reference: ClosingReference, closing: ClosingMode, holding: HoldingMode
+    ) -> None:
+        """Raise `BadArgument` if the hand would press harder than the plan's `max_force`.
+
+        A hand that waits presses in the holds "force" and "grip" alone, which keep to the limit.
+        """
+        if reference.max_force is None:
+            return
+        stops = self.options.wait or closing in ("position", "paper_position")
+        if stops and holding != "law":
+            return
+        most = float((-dot(reference.gains.desired_force, reference.normals)).max())
+        if most > reference.max_force * (1 + ROUNDING):
+            found = f"{reference.max_force:g}, with a desired force of {most:g} N"
+            allowed = "a plan with less force: `ClosingReference.from_grasp(force=...)`"
+            raise BadArgument("reference.max_force", found, allowed)
 
     def _prepare(self, reference: ClosingReference, approach: float) -> None:
         """Start with a plan: first its approach of length `approach` [m], if that is not 0, and
@@ -123,7 +155,7 @@ class GraspController:
         self._make_closing = functools.partial(make_closing, reference, self.mode, self.options)
         self._begin(self._make_closing())
         opened = reference.expand(reference.pregrasp)
-        self.targets = Targets(opened, self.path + reference.rise, approach)
+        self._sent = Targets(opened, self.path + reference.rise, approach)
 
     def _begin(self, closing: Closing) -> None:
         """Start a new attempt to close the hand, controlled by `closing`, and count it."""
@@ -134,6 +166,11 @@ class GraspController:
         self.time = 0.0
         self.pressed = 0.0
         self.attempts += 1
+
+    @property
+    def targets(self) -> Targets:
+        """The present `Targets`, which the last `step` returned, in tensors of their own."""
+        return self._sent.copied()
 
     @property
     def approaching(self) -> bool:
@@ -272,20 +309,25 @@ class GraspController:
         Raises `BadArgument` for an observation of another hand or on another device, or a period
         out of range.
         """
-        shape = len(self.reference.normals), 3, len(self.targets.joints)
+        shape = len(self.reference.normals), 3, len(self._sent.joints)
         found = tuple(observation.jacobian.shape)
         if found != shape or observation.tactile.reading.shape != shape[:1]:
             told = f"fingertips, 3 and joints {found}"
             raise BadArgument("observation", told, f"those of the hand, {shape}")
-        device = self.targets.joints.device
+        device = self._sent.joints.device
         check_device("observation", observation.joints.device, "the controller", device)
+        if (up := observation.up) is not None and abs(float(norm(up)) - 1) > UNIT_ERROR:
+            found = f"a vector of length {float(norm(up)):g}"
+            raise BadArgument("observation.up", found, "a unit vector")
+        # what is remembered must stay: a robot may read its sensors into the same memory
+        observation = map_tensors(torch.clone, observation)
         if self.guard is not None:
-            self.targets = self._approach(self.guard, observation, period)
+            self._sent = self._approach(self.guard, observation, period)
         elif self.reopening is not None:
-            self.targets = self._reopen(self.reopening, period)
+            self._sent = self._reopen(self.reopening, period)
         else:
             joints = self._close_or_hold(observation, period)
-            self.targets = Targets(joints, self.path + self.closing.palm)
+            self._sent = Targets(joints, self.path + self.closing.palm)
             self._judge(observation)
         return self.targets
 
@@ -300,7 +342,7 @@ class GraspController:
             located = guard.stops or self.attempts > 1
             if located and isinstance(self.closing, UncertaintyClosing):
                 self.closing.begin_at(guard.displacement, guard.palm)
-        return Targets(self.targets.joints, self.path + guard.palm, guard.left)
+        return Targets(self._sent.joints, self.path + guard.palm, guard.left)
 
     def _close_or_hold(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the joint targets of the closing controller, or of the hold controller once
@@ -313,12 +355,12 @@ class GraspController:
             if judging and isinstance(closing, UncertaintyClosing):
                 if not bool(closing.touched.all()):
                     # without a finger that opposes them, pressing ones push the object away
-                    return self.targets.joints
+                    return self._sent.joints
             return self.hold(observation, period)
         over = closing.done or self.time >= CLOSING_TIME
         if over and closing.feels:
             self._begin_hold(observation)
-            return self.targets.joints
+            return self._sent.joints
         if self.judges:
             if self.time == 0.0:
                 self.felt.append(Touches(self.reference, kept=True))
@@ -333,7 +375,7 @@ class GraspController:
             assert isinstance(closing, LawClosing)
             self.hold = closing.press()
         else:
-            self.hold = self._make_hold(self.reference, observation, self.targets.joints)
+            self.hold = self._make_hold(self.reference, observation, self._sent.joints)
         if self.judges:
             assert isinstance(closing, UncertaintyClosing)
             last = self.attempts >= self.options.attempts

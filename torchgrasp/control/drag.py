@@ -97,7 +97,6 @@ class DragController:
         phase: what the hand does ("down", "drag", "up"), or "done".
         status: `OK`, or `NO_CONTACT` for a hand that could not press, or lost the object on the way.
             It then rises at once.
-        targets: the present targets, those of the last `step`.
 
     Raises `BadArgument` for a plan of another hand, without a pressing finger or a positive force,
     or without a displacement.
@@ -139,7 +138,12 @@ class DragController:
         self.time = 0.0
         self.missing = 0.0
         self.straighten = 0.0
-        self.targets = self._targets()
+
+    @property
+    def targets(self) -> Targets:
+        """The present targets, in tensors of their own."""
+        palm = self.height * self.up + smooth_step(self.share)[0] * self.way + self.lag
+        return Targets(self.joints, palm).copied()
 
     @checked
     def step(self, observation: Observation, period: Annotated[float, Range(1e-5, 1.0)]) -> Targets:
@@ -163,7 +167,6 @@ class DragController:
             self.height += DRAGGING.rise * period
             if self.height >= DRAGGING.height:
                 self.phase = "done"
-        self.targets = self._targets()
         return self.targets
 
     def _press(self, force: float, period: float) -> None:
@@ -209,11 +212,6 @@ class DragController:
             return -(DRAGGING.touching if near else DRAGGING.fastest)
         speed = DRAGGING.gain * (force - self.plan.force)
         return max(-DRAGGING.touching, min(speed, DRAGGING.touching))
-
-    def _targets(self) -> Targets:
-        """Return the targets of all joints, and of the palm at its present height and share."""
-        palm = self.height * self.up + smooth_step(self.share)[0] * self.way + self.lag
-        return Targets(self.joints, palm)
 
 
 def _shortened(vector: Float[Tensor, "3"], most: float) -> Float[Tensor, "3"]:

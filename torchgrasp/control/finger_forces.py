@@ -14,15 +14,17 @@ from torch import Tensor
 from torchgrasp.contacts.balance import least_friction_forces
 from torchgrasp.foundation.base import Value, named_tensors, settle
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Force, Positive, check_dense, is_known
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.linalg import dot, norm
 from torchgrasp.hand.drives import joint_stiffness
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps
 
 CHANGED = 1e-3  # change [m] of a fingertip's place that shows another geometry: above rounding
+MOVED = 0.01  # distance [m] of contacts that are no better known ones, but of another frame or unit
+UNIT_ERROR = 1e-3  # largest error of the length of a unit normal
 
 
 @checked
@@ -172,7 +174,7 @@ def check_same_hand(hand: Hand, grasps: Grasps) -> None:
     if named != ",".join(hand.joint_names):
         ours = ", ".join(hand.joint_names)
         raise BadArgument("grasps", f"the joints {named}", f"those of the hand: {ours}")
-    if grasps.meta.get("hand_sha256") != hand.source.sha256 and is_known(grasps.joints):
+    if is_known(grasps.joints):
         _check_reached(hand, grasps)
 
 
@@ -180,7 +182,8 @@ def check_same_hand(hand: Hand, grasps: Grasps) -> None:
 def _check_reached(hand: Hand, grasps: Grasps) -> None:
     """Raise `BadArgument` if fingertips are farther from their contacts than they were planned.
 
-    Then the hand's geometry is another one than that of the plan.
+    Then the hand's geometry is another one than that of the plan, or the contacts were changed.
+    Raise it for normals that are no unit vectors, too, or that point into the object.
     """
     grasps = grasps.to("cpu", torch.float64)
     points, normals = contacts_in_hand(grasps)
@@ -188,12 +191,26 @@ def _check_reached(hand: Hand, grasps: Grasps) -> None:
     pads, _ = hand.fingertips(grasps.joints)
     centres = hand.tip_centres(grasps.joints)
     rolled = points + hand.tips.radius[:, None] * normals
+    lengths = norm(normals)
+    if bool(((lengths - 1).abs() > UNIT_ERROR).any()):
+        found = f"vectors of length {float(lengths.min()):g} to {float(lengths.max()):g}"
+        raise BadArgument("grasps.contacts.normals", found, "unit vectors")
+    behind = dot(centres - points, normals) < 0
+    good = grasps.status == Status.OK
+    if bool(behind[good].all(-1).any()):
+        found = "normals that point from fingertips into the object"
+        raise BadArgument("grasps.contacts.normals", found, "outward normals of the object")
     # the pad lies at the contact, or the fingertip has rolled on it
     off = torch.minimum(norm(pads - points), norm(centres - rolled))
-    if bool((off > grasps.tip_error + CHANGED).any()):
-        most = 1000 * float(off.nan_to_num().max())
-        found = f"{hand.name}, whose fingertips are up to {most:.0f} mm off the contacts"
-        raise BadArgument("hand", found, "the hand with which the grasps were planned")
+    most = CHANGED
+    if grasps.meta.get("hand_sha256") == hand.source.sha256:
+        # the same hand: contacts may be known better than they were planned
+        off = torch.minimum(off, (norm(centres - points) - hand.tips.radius).abs())
+        most = MOVED
+    if bool((off > grasps.tip_error + most).any()):
+        largest = 1000 * float(off.nan_to_num().max())
+        found = f"{hand.name}, whose fingertips are up to {largest:.0f} mm off the contacts"
+        raise BadArgument("hand", found, "the hand and the contacts that were planned")
 
 
 def press(

@@ -60,6 +60,8 @@ class FeltLoadNumbers:
     """Ratio to the largest load so far, above which a load counts as new."""
     steady: float = 0.3
     """Time [s] without a new load after which the load is steady."""
+    turned: float = 0.05
+    """Angle [rad] by which a hand turns until its load is weighed anew."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,13 +164,14 @@ class LoadEstimate:
     changes slowly. Once the lifted load has been steady (`settles`), its mean force gives the mass.
 
     Args:
-        up: unit normal (3,) of the table in the hand's frame. The object's weight acts against it.
-            None means that the whole load may be due to the object.
+        up: unit vector (3,) that points up in the hand's frame, such as the table's normal. The
+            object's weight acts against it. None means that the whole load may be due to the object.
         push: largest force [N] by which something else may push at the lifted object.
     """
 
     def __init__(self, up: np.ndarray | None, push: float) -> None:
         self.up = up
+        self.level = up  # up when the load began to be weighed
         self.push = push
         self.wrench = np.zeros(6)
         self.carried = np.zeros(6)
@@ -188,6 +191,14 @@ class LoadEstimate:
         if self.steady:
             self.weighings += 1
             self.weighed = self.weighed + (load[:3] - self.weighed) / self.weighings
+
+    def turn(self, up: np.ndarray) -> None:
+        """Take the unit vector `up` (3,) of a hand that has turned; a weighing then begins anew."""
+        self.up = up
+        if self.level is None or float(up @ self.level) < math.cos(LOAD.turned):
+            self.level = up
+            self.weighed = np.zeros(3)
+            self.weighings = 0
 
     def settles(self, period: float) -> bool:
         """Return whether the object is lifted, and its load has not grown for 0.3 s

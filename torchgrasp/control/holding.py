@@ -278,6 +278,8 @@ class GripHold:
                 # the fingers that touch cannot hold without the others
                 contacts = balance(points)
         self.felt = smooth(self.felt, forces, GRIP.forces, period)
+        if observation.up is not None:
+            self.load.turn(observation.up.numpy())
         self.load.update(contacts.wrench @ forces.ravel(), period)
         sure = min(max(GRIP.sure * (self.time - GRIP.settled), 0.0), 1.0)
         push = self.cover * sure * (PUSH + self.unfelt)

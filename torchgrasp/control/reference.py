@@ -18,8 +18,8 @@ from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, Force, Pose, Positive, Range
-from torchgrasp.geometry.frames import inverse, rotate
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.drives import drive_stiffness, joint_stiffness
@@ -66,6 +66,8 @@ class ClosingReference(Value):
             12 of the paper). The closing mode "paper" needs it. None if it is unknown.
         friction: coefficient of friction that the grasp was planned for, 0 to 10, or its
             `Distribution`.
+        planned_table: table of the plan (`Grasps.table`) in the frame of the planned hand. A
+            `GraspController` refuses a `table` that is far from it. None means no comparison.
 
     Raises `BadArgument` for a number outside its range, or a pose that is not rigid.
     """
@@ -85,6 +87,7 @@ class ClosingReference(Value):
     max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
     distance_variance: Float[Tensor, "f"] | None = None
     friction: Annotated[float, Range(0.0, 10.0)] | Distribution = ContactSpec.friction
+    planned_table: Plane | None = None
 
     @classmethod
     @checked
@@ -175,6 +178,7 @@ class ClosingReference(Value):
             approach=unit(direction) if bool((direction != 0.0).any()) else None,
             distance_variance=_distance_variance(grasp),
             friction=_friction(grasp),
+            planned_table=grasp.table and grasp.table.moved(inverse(grasp.obj_from_hand[0])),
         )
 
     @checked
@@ -259,6 +263,57 @@ class ClosingReference(Value):
         fingertips. Tips and result are in the frame of the hand's root link at the planned pose.
         """
         return tips - self.hand.tips.radius[:, None] * self.normals
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanNumbers:
+    """Bounds on a closing plan whose parts are in different frames or units."""
+
+    unit: float = 1e-3
+    """Largest error of the length of a unit vector."""
+    tilt: float = 0.5
+    """Largest angle [rad] between the table and that of the plan: no measurement errs so much."""
+    off: float = 0.05
+    """Largest distance [m] between both tables at the contacts."""
+    surface: float = 0.05
+    """Largest median distance [m] of the planned contacts from the estimated surface."""
+
+
+PLAN = PlanNumbers()
+
+
+def check_plan(reference: ClosingReference) -> None:
+    """Raise `BadArgument` for a closing plan whose parts do not fit together: drives of another
+    hand, vectors that are no unit vectors, a table or a surface in another frame.
+    """
+    joints = len(reference.hand.tree.joint_names)
+    if len(reference.kp) != joints or not bool((reference.kp > 0).all()):
+        found = f"{len(reference.kp)} stiffnesses from {float(reference.kp.min()):g}"
+        raise BadArgument("reference.kp", found, f"{joints} positive ones, of all joints")
+    lengths = {"reference.normals": norm(reference.normals)}
+    if reference.approach is not None:
+        lengths["reference.approach"] = norm(reference.approach)[None]
+    for name, length in lengths.items():
+        if bool(((length - 1).abs() > PLAN.unit).any()):
+            raise BadArgument(name, f"lengths {length.tolist()}", "unit vectors")
+    points = reference.gains.target
+    if reference.table is not None and reference.planned_table is not None:
+        table = reference.table
+        planned = reference.planned_table
+        tilt = float(table.normal.double() @ planned.normal.double())
+        off = float((table.height(points) - planned.height(points)).abs().max())
+        if tilt < math.cos(PLAN.tilt) or off > PLAN.off:
+            degrees = math.degrees(math.acos(max(min(tilt, 1.0), -1.0)))
+            found = f"one {degrees:.0f} degrees and {1000 * off:.0f} mm off that of the grasp"
+            allowed = "that in the hand's frame: `grasp.table.moved(hand_from_obj)`"
+            raise BadArgument("reference.table", found, allowed)
+    if reference.surface is not None:
+        distance, _ = reference.surface.query(apply(reference.obj_from_hand, points))
+        off = float(distance.abs().median())
+        if off > PLAN.surface:
+            found = f"one {1000 * off:.0f} mm off the planned contacts"
+            allowed = "the estimated surface of this object, in the frame of the grasp"
+            raise BadArgument("reference.surface", found, allowed)
 
 
 def check_single(grasp: Grasps) -> None:

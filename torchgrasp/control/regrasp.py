@@ -70,7 +70,7 @@ def next_grasp(
 
 @checked
 def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
-    """Return the indices (k,) of the k grasps that differ from each grasp with an index in `tried`.
+    """Return the indices (k,) of the executable grasps that differ from each grasp in `tried`.
 
     Two grasps differ if their approaches are more than 30 degrees apart (`REGRASP.turn`). They also
     differ if the mean distance of their contacts is more than 15 mm (`REGRASP.gap`).
@@ -79,7 +79,7 @@ def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
     points = grasps.contacts.points.double()
     gaps = norm(points[:, None] - points[list(tried)]).mean(-1)  # (g, t)
     differs = (gaps > REGRASP.gap) | (approach @ approach[list(tried)].T < math.cos(REGRASP.turn))
-    return flatnonzero(differs.all(-1))
+    return flatnonzero(differs.all(-1) & (grasps.status == Status.OK))
 
 
 def _chances(
@@ -127,7 +127,8 @@ class GraspTry:
             It is a rigid transform in the frame of the grasps. The `controller` works in a frame
             that moves with the object. Transform a cloud for `relook` by the inverse of `moved`.
 
-    Raises `BadArgument` if `tried` is empty, or an index in it is none of the grasps.
+    Raises `BadArgument` if `tried` is empty, or an index in it is none of the grasps. Raises it if
+    the grasp of this try failed a check of the planner.
     """
 
     @checked
@@ -141,6 +142,10 @@ class GraspTry:
     ) -> None:
         if not tried or not all(0 <= row < len(grasps) for row in tried):
             raise BadArgument("tried", list(tried), f"rows of the {len(grasps)} grasps")
+        status = Status(int(grasps.status[tried[-1]]))
+        if status is not Status.OK:
+            found = f"grasp {tried[-1]}, which failed: {status.sentence}"
+            raise BadArgument("tried", found, "rows of executable grasps")
         self.grasps = grasps
         self.start = start
         self.surface = surface
@@ -162,9 +167,9 @@ class GraspTry:
     def others(self) -> Int[Tensor, "k"]:
         """The indices (k,) of the grasps that are left to try.
 
-        A grasp is left if it differs from each tried grasp. Two grasps differ if their approaches
-        are more than 30 degrees apart (`REGRASP.turn`). They also differ if the mean distance of
-        their contacts is more than 15 mm (`REGRASP.gap`).
+        An executable grasp is left if it differs from each tried grasp. Two grasps differ if their
+        approaches are more than 30 degrees apart (`REGRASP.turn`). They also differ if the mean
+        distance of their contacts is more than 15 mm (`REGRASP.gap`).
         """
         return list_others(self.grasps, self.tried)
 
@@ -272,7 +277,7 @@ class Withdrawal:
         reference = controller.reference
         palm = controller.targets.palm
         here = torch.zeros(6, dtype=torch.float64)
-        joints = observation.joints
+        joints = observation.joints.clone()  # the robot may read into one buffer
         self.opening = Reopening(reference, here, joints, palm, palm + reference.rise, reach=0.0)
         self.period = period
         self.length = length
@@ -283,9 +288,9 @@ class Withdrawal:
         opening = self.opening
         while not opening.done:
             joints = opening(self.period)
-            yield Targets(joints, opening.palm)
+            yield Targets(joints, opening.palm).copied()
         ticks = max(1, round(REGRASP.withdrawal / self.period))
         for k in range(2 * ticks):
             share, rate = smooth_step(min((k + 1) / ticks, 1.0))
             self.speed = self.length * rate / (ticks * self.period)
-            yield Targets(opening.opened, opening.palm, self.length * share)
+            yield Targets(opening.opened, opening.palm, self.length * share).copied()

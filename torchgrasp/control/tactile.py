@@ -50,6 +50,8 @@ class TactileNumbers:
 
 
 TACTILE = TactileNumbers()
+ASTRAY = 1.0
+"""Distance [rad or m] of a measured joint beyond its limits that no encoder's error explains."""
 
 
 @checked
@@ -258,6 +260,10 @@ class Targets(NamedTuple):
     palm: Float[Tensor, "3"] = STILL
     left: float = 0.0
 
+    def copied(self) -> "Targets":
+        """Return the same targets in new tensors, which the receiver may change."""
+        return Targets(self.joints.clone(), self.palm.clone(), self.left)
+
 
 @checked
 @dataclasses.dataclass(frozen=True)
@@ -273,25 +279,35 @@ class Observation(Value):
         jacobian: Jacobian (f, 3, j) [m/rad] of these centres with respect to all joints. Each
             column is for one joint alone, without the joints that are coupled to it.
         tactile: readings of the fingertips.
+        up: unit vector (3,) that points up. None means the table's normal of the plan: then the
+            hand must not turn while it holds.
     """
 
     joints: Float[Tensor, " j"]
     tips: Float[Tensor, "f 3"]
     jacobian: Float[Tensor, "f 3 j"]
     tactile: TactileState
+    up: Float[Tensor, "3"] | None = None
 
 
 @checked
-def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
+def observe(
+    hand: Hand,
+    joints: Float[Tensor, " h"],
+    tactile: TactileState,
+    up: Float[Tensor, "3"] | None = None,
+) -> Observation:
     """Return the observation of a robot, from its measured joints and fingertip readings.
 
     Args:
         hand: the hand.
         joints: measured actuated joints (h,) [rad or m], in the order of `hand.joint_names`.
         tactile: readings of the f fingertips (`feel_flags`, `feel_torques` or `measure`).
+        up: unit vector (3,) that points up, in the frame of the hand's root link. Give it where the
+            arm turns the hand while it holds. None means the table's normal of the plan.
 
     Raises `BadArgument` for joints or fingertips on another device than the hand, or another number
-    of joints.
+    of joints. Raises it for a joint that is far beyond its limits, too, as one in degrees.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -300,9 +316,25 @@ def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> O
     """
     check_device("tactile", tactile.lagged.device, "the hand", hand.lower.device)
     joints = joints.double()
+    _check_places(hand, joints)
     tips = hand.tip_centres(joints)
     everything = hand.expand_joints(joints)
-    return Observation(everything, tips, joint_jacobian(hand, everything, tips), tactile)
+    up = None if up is None else up.double()
+    return Observation(everything, tips, joint_jacobian(hand, everything, tips), tactile, up)
+
+
+def _check_places(hand: Hand, joints: Float[Tensor, " h"]) -> None:
+    """Raise `BadArgument` for a measured joint far beyond its limits."""
+    if len(joints) != hand.dof:
+        return  # told by the kinematics
+    beyond = torch.maximum(hand.lower.double() - joints, joints - hand.upper.double())
+    if float(beyond.max()) > ASTRAY:
+        worst = int(beyond.argmax())
+        low = float(hand.lower[worst])
+        high = float(hand.upper[worst])
+        found = f"{float(joints[worst]):g} of {hand.joint_names[worst]}"
+        allowed = f"positions near its limits, {low:g} to {high:g}, in radians or metres"
+        raise BadArgument("joints", found, allowed)
 
 
 def joint_jacobian(

@@ -119,6 +119,7 @@ def close_hand(
         BadArgument: there is not exactly one grasp, or its approach is no unit vector.
         BadArgument: joints are of another hand, or a pre-grasp is outside the joint limits.
         BadArgument: contacts are off the mesh, or the mesh does not stand on the `table`.
+        BadArgument: a `slide` without an approach, or `told` without a table.
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
 

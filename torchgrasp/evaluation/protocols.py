@@ -94,6 +94,8 @@ class Protocol(Value):
             before the approach.
         tries: largest number of grasps of a view to try, one after the other, in one lift
             (`lift_grasps`).
+        real_mass: whether `evaluate` gives an object its `mass_kg` of the manifest. An object
+            without one has the mass of `trial`. The planner is told the mass of `trial` alone.
 
     Raises `BadArgument` for:
 
@@ -110,6 +112,7 @@ class Protocol(Value):
     push: Annotated[float, Range(0.0, 1000.0)] = 0.0
     relook: bool = False
     tries: Count = 1
+    real_mass: bool = False
 
     def __post_init__(self) -> None:
         """Raise `BadArgument` if fields contradict each other."""
@@ -144,13 +147,18 @@ class Protocol(Value):
     def with_trial(self, **changes: Any) -> "Protocol":
         """Return the protocol with some fields of its `trial` changed.
 
-        `changes` are new values of fields of `TrialSpec`, by name. Raises `BadArgument` for a wrong
+        `changes` are new values of fields of `TrialSpec`, by name. A `mass` replaces the `density`
+        of the trial, and the masses of the manifest. Raises `BadArgument` for a wrong
         value, and `TypeError` for an unknown field.
 
         >>> find_protocol("tabletop").with_trial(closing="fixed").trial.closing
         'fixed'
         """
-        return dataclasses.replace(self, trial=dataclasses.replace(self.trial, **changes))
+        real = self.real_mass and "mass" not in changes
+        if "mass" in changes:
+            changes = {"density": None, **changes}
+        trial = dataclasses.replace(self.trial, **changes)
+        return dataclasses.replace(self, trial=trial, real_mass=real)
 
 
 _FLOATING = TrialSpec(
@@ -188,7 +196,7 @@ PROTOCOLS = {
         Protocol("pose-noise", _FLOATING, _PULL, dataclasses.replace(POSE_NOISE, draws=20)),
         Protocol("paper", TrialSpec(), noise=POSE_NOISE),
         Protocol("tabletop", TrialSpec(friction=0.6, shake=0.003)),
-        Protocol("household", TrialSpec(shake=0.003)),
+        Protocol("household", TrialSpec(shake=0.003), real_mass=True),
         Protocol(
             "table-lift",
             TrialSpec(mass=0.249, table_friction=0.2, lift_height=0.2, approach=0.16),
@@ -206,7 +214,7 @@ PROTOCOLS = {
 * paper: the paper's lift (Sec. 6.5) at friction 0.8; the object's pose errs at random, as on a real
   robot.
 * tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
-* household: the same at friction 0.8.
+* household: the same at friction 0.8, with the masses of the manifest (`mass_kg`).
 * table-lift: a lift by 0.2 m of 0.249 kg, as published for single-view policies. The friction is
   0.8 at the fingertips and 0.2 at the table. One of three grasps must have raised the object by 0.1
   m at the end. `noise` and `push` displace and push it.

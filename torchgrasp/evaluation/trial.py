@@ -29,9 +29,10 @@ from torchgrasp.evaluation.true_scene import (
     true_scene,
 )
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Pose, Seed
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import read_mesh
@@ -83,7 +84,7 @@ class Truth:
             It ends where the plan's table (`Grasps.table`) ends.
         neighbours: other bodies on the table, which the hand may push.
         slide: displacement (3,) [m] of the object along the table, halfway through the approach.
-            None means no displacement. Without an approach there is no displacement either.
+            None means no displacement. A trial without an approach refuses it.
         camera: pose (4, 4) [m] of a depth camera (x right, y down, z forward). With it the robot
             looks again before the approach. None means no second look.
 
@@ -161,6 +162,7 @@ class TrialDriver:
         planned = trial.grasp.to("cpu", torch.float64)
         pose = planned.obj_from_hand[0]
         told = trial.grasp.table if trial.told is None else trial.told
+        _check_effects(trial, spec)
         # what the simulator and the robot get: in the frame of the grasp, or of world and hand
         self.obj_from_world = torch.eye(4, dtype=torch.float64)
         grasp = planned
@@ -243,6 +245,20 @@ class TrialDriver:
         return open_scene(scene_spec, self.spec.simulator).penetration()
 
 
+def _check_effects(trial: GraspTrial, spec: TrialSpec) -> None:
+    """Raise `BadArgument` for what a trial without a table or an approach would ignore; warn of a
+    surface that its closing does not look at.
+    """
+    if trial.told is not None and not spec.table:
+        raise BadArgument("told", "a table, for a trial without one", "None")
+    slide = trial.truth.slide
+    if slide is not None and bool(slide.any()) and not spec.approach:
+        found = "a displacement halfway through an approach of 0 m"
+        raise BadArgument("slide", found, "None, or an approach above 0 m")
+    if trial.surface is not None and spec.closing == "open_loop":
+        warn_user(NoEffect, "surface: the closing 'open_loop' looks at no surface")
+
+
 def true_table(grasps: Grasps, truth: Truth) -> Plane:
     """Return the table of a `truth`, in the frame of the grasp. If it has none, return a level
     table at the mesh's lowest point.
@@ -298,6 +314,8 @@ def derive_reference(
     table = table and table.moved(inverse(grasp.obj_from_hand[0]))
     sensor = sensor or plan.sensor
     known = {"table": table, "surface": surface, "sensor": sensor, "max_force": max_force}
+    # trials also tell tables that are wrong, and grasps that were moved into another frame
+    known["planned_table"] = None
     return dataclasses.replace(plan, **known)
 
 

@@ -264,6 +264,9 @@ def try_grasp(
     `BadArgument` if the protocol has a second look (`Protocol.relook`), but the view's camera
     position is unknown.
     """
+    mass = read_entry(view.objects, view.object).mass if protocol.real_mass else None
+    if mass is not None:
+        protocol = protocol.with_trial(mass=mass)
     others = [k for k in range(len(grasps)) if k != at[0] and protocol.tries > 1]
     grasp = grasps[[at[0], *others]]
     hand = hand_of(grasp, view.load_hand())
@@ -316,14 +319,33 @@ def _camera_of(cloud: PointCloud) -> Float[Tensor, "4 4"]:
     return look_at(math.degrees(azimuth), math.degrees(elevation), math.hypot(x, y, z), middle)
 
 
-@functools.lru_cache(maxsize=2)
 def _fit_surface(objects: Path, name: str, view: str) -> SignedDistanceField:
     """Return the estimated surface of a view as a distance field, to locate the object by touch."""
+    stamps = _stamps(objects, "manifest.json", f"{name}/{view}_noisy.ply")
+    return _kept_surface(objects, name, view, stamps)
+
+
+def _read_solid(objects: Path, name: str) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
+    """Return the mesh and convex parts of a dataset object."""
+    return _kept_solid(objects, name, _stamps(objects, "manifest.json", f"{name}/mesh.ply"))
+
+
+def _stamps(objects: Path, *files: str) -> tuple[tuple[int, int], ...]:
+    """Return time and size of files, which change with their contents; 0 for one that is missing."""
+    found = [(objects / x).stat() if (objects / x).is_file() else None for x in files]
+    return tuple((0, 0) if x is None else (x.st_mtime_ns, x.st_size) for x in found)
+
+
+@functools.lru_cache(maxsize=2)
+def _kept_surface(objects: Path, name: str, view: str, stamps: tuple) -> SignedDistanceField:
+    """Return the estimated surface of a view, whose files have the `stamps`."""
     return surface_field(fit_shape(read_view(objects, name, view), table=Plane.horizontal(0.0)))
 
 
 @functools.lru_cache(maxsize=2)
-def _read_solid(objects: Path, name: str) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
-    """Return the mesh and convex parts of a dataset object."""
+def _kept_solid(
+    objects: Path, name: str, stamps: tuple
+) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
+    """Return the mesh and convex parts of an object, whose files have the `stamps`."""
     mesh = read_object_mesh(objects, name)
     return mesh, convex_parts(mesh)

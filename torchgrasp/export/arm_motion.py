@@ -10,7 +10,7 @@ from torchgrasp.arm.arm import Arm
 from torchgrasp.arm.reach import track, way_of
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.postures import named_postures
-from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Positive
@@ -64,7 +64,8 @@ def plan_motion(
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
 
     Raises `BadArgument` for grasps that were planned without this arm, or with another pose of its
-    base. It is also raised for joints of another hand.
+    base. It is also raised for joints of another hand, and for an approach that the arm cannot
+    follow.
 
     >>> grasps = plan_grasps(cloud, hand, spec, arm=arm)  # doctest: +SKIP
     >>> motion = plan_motion(arm, hand, grasps[:1])  # doctest: +SKIP
@@ -80,7 +81,11 @@ def plan_motion(
     poses = way_of(hand.to("cpu", torch.float64), grasps, CollisionWorld(table=grasps.table))
     tips = arm.tip_poses(poses.flatten(0, 1))
     tips = tips.unflatten(2, poses.shape[:2])
-    way, _ = track(arm, grasps.arm.T.contiguous(), tips)  # (g, 2 near + 1, n)
+    way, steady = track(arm, grasps.arm.T.contiguous(), tips)  # (g, 2 near + 1, n)
+    if not bool(steady.all()):
+        lost = flatnonzero(~steady).tolist()
+        found = f"the approach or the lift of grasps {lost}, which the arm cannot follow"
+        raise BadArgument("grasps", found, "executable grasps of plan_grasps(arm=), unchanged")
     postures = named_postures(hand, grasps, force, kp)[1]
     opened, closed, pressed = (
         torch.stack(list(joints.values()), -1)[:, None] for joints in postures.values()

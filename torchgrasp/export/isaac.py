@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.export.postures import (
+    check_flange,
     check_still,
     follower_joints,
     named_postures,
@@ -117,8 +118,8 @@ def format_isaac(
     poses = grasps.obj_from_hand.double()
     if flange is not None:
         frame = gripper_link or FLANGE
-        _check_flange(hand, grasps, frame, flange.double().cpu())
-        poses = poses @ flange.double().cpu()
+        _check_flange(hand, grasps, frame, check_flange(flange))
+        poses = poses @ check_flange(flange)
     else:
         frame = gripper_link or root
         poses = poses @ _root_from_link(hand, grasps, frame.rpartition("/")[2])

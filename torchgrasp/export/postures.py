@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.control.finger_forces import Squeeze, squeeze
+from torchgrasp.control.finger_forces import UNIT_ERROR, Squeeze, squeeze
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.files import format_json
 from torchgrasp.foundation.checks import checked
@@ -19,6 +19,7 @@ from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Force, Pose, Positive
 from torchgrasp.geometry.frames import rotate
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.hand.drives import stiff_drives
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
@@ -33,6 +34,7 @@ CONVENTIONS: dict[str, Any] = json.loads(
 """Meaning of the numbers in a JSON file of grasps; the file contains this text."""
 OWN_FORMAT = "torchgrasp grasps"
 OWN_VERSION = 3  # version 1 had no approach, version 2 no rise
+FARTHEST = 1.0  # distance [m] of a flange from a hand: farther is in millimetres
 TASK = "task_margin", "task_load", "task_twist", "task_forces", "task_strength"
 """Fields of the `Certificate`, which explains them. The file has them if grasps were planned with
 `resist`.
@@ -67,7 +69,8 @@ def format_grasps(
             the flange's pose is added as "flange". None adds nothing.
 
     Raises `BadArgument` for joints of another hand, and for names that are unknown, empty or equal.
-    It is also raised for a `force` outside 0.01 to 100 N, or a `kp` that is not positive.
+    It is also raised for a `force` outside 0.01 to 100 N, or a `kp` that is not positive. It is
+    raised for a flange beyond 1 m, and for executable grasps whose joints exceed their limits.
 
     >>> import json
     >>> from torchgrasp import load_hand
@@ -105,7 +108,7 @@ def format_grasps(
             "pose": describe_pose(pose),
         }
         if flange is not None:
-            entry["flange"] = describe_pose(pose.double() @ flange.double().cpu())
+            entry["flange"] = describe_pose(pose.double() @ check_flange(flange))
         direction = grasps.approach[row].tolist()
         entry["approach"] = {"direction": direction, "distance": APPROACH_DISTANCE}
         entry["rise"] = (opened[row] - pose)[:3, 3].tolist()
@@ -157,12 +160,38 @@ def named_postures(
     hand = hand.to("cpu")
     grasps = grasps.to("cpu")
     squeezed = squeeze(hand, grasps, force, kp)
+    _check_executable(hand, grasps[grasps.status == Status.OK])
     postures = {
         "pregrasp": grasps.pregrasp.double(),
         "grasp": grasps.joints.double(),
         "squeeze": squeezed.joints,
     }
     return squeezed, {name: hand.expand(joints) for name, joints in postures.items()}
+
+
+def _check_executable(hand: Hand, grasps: Grasps) -> None:
+    """Raise `BadArgument` for joints of executable grasps beyond their limits, or an approach that
+    is no unit vector.
+    """
+    limits = hand.to(torch.float64).actuated
+    limits.check_limits(grasps.joints.double(), "grasps.joints")
+    limits.check_limits(grasps.pregrasp.double(), "grasps.pregrasp")
+    off = (norm(grasps.approach.double()) - 1).abs()
+    if bool((off > UNIT_ERROR).any()):
+        found = f"vectors up to {1 + float(off.max()):g} long"
+        raise BadArgument("grasps.approach", found, "unit vectors")
+
+
+def check_flange(flange: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """Return the pose [m] of a flange in the hand's frame, in float64 on the CPU.
+
+    Raises `BadArgument` for one so far from the hand that it is not in metres.
+    """
+    away = float(norm(flange[:3, 3]))
+    if away > FARTHEST:
+        found = f"one {away:g} m from the hand's root link"
+        raise BadArgument("flange", found, f"a position within {FARTHEST:g} m, in metres")
+    return flange.double().cpu()
 
 
 def stands_still(hand: Hand, grasps: Grasps) -> Bool[Tensor, "g"]:

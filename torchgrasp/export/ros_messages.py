@@ -13,6 +13,7 @@ from torch import Tensor
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.arm_motion import ArmMotion
 from torchgrasp.export.postures import (
+    check_flange,
     check_still,
     follower_joints,
     named_postures,
@@ -104,7 +105,7 @@ def format_moveit(
     up = UP if grasps.table is None else grasps.table.normal
     poses = grasps.obj_from_hand.double()
     if flange is not None:
-        poses = poses @ flange.double().cpu()
+        poses = poses @ check_flange(flange)
     check_still(hand, grasps)
     # two motions, to the pre-grasp and from there
     times = POSE_TIME, POSE_TIME, 2 * POSE_TIME

@@ -20,6 +20,7 @@ GRAVITY = 9.81
 RIM = 0.001  # radius [m] that is flat on a rim
 PAPER_RADIUS = 0.1  # the paper's radius of starts, normalised
 ROUNDING = 1e-9  # relative error of a period
+UNEVEN = 1e-3  # largest relative error of a period that is no whole number of timesteps
 FRICTIONS = Range(0.0, 10.0)
 """The coefficients of friction that are possible."""
 MASSES = Range(0.001, 10.0)
@@ -364,8 +365,10 @@ class TrialSpec(Value):
     * `options` of a closing that has none;
     * a closing or holding that needs more than the `sensor` measures;
     * the holding "law" after a closing that does not follow Eq. 25;
+    * the holding "grip" or "impedance" after the closing "open_loop";
+    * a `max_force` with a holding that cannot keep it (`check_limit`);
     * a `force` above `max_force`, or a `table_friction` above the least `friction`;
-    * a control period below one timestep.
+    * a control period that is no whole number of timesteps.
 
     >>> TrialSpec(mass=0.3).pressing, TrialSpec(force=6.0).pressing
     ('grip', 'force')
@@ -400,6 +403,7 @@ class TrialSpec(Value):
     def __post_init__(self) -> None:
         choose_options(self.closing, self.options)
         check_modes(self.sensor, self.closing, self.pressing)
+        check_limit(self.max_force, self.closing, self.pressing)
         if self.max_force is not None and self.force is not None and self.force > self.max_force:
             raise BadArgument("force", self.force, f"at most max_force, {self.max_force:g}")
         check_within("mass", self.mass, MASSES)
@@ -412,6 +416,15 @@ class TrialSpec(Value):
         if not self.control_rate * self.timestep < 1 + ROUNDING:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")
+        steps = 1 / (self.control_rate * self.timestep)
+        whole = max(1, round(steps))
+        if abs(steps / whole - 1) > UNEVEN:
+            found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
+            slower = 1 / ((whole + 1) * self.timestep)
+            near = f"{1 / (whole * self.timestep):g} or {slower:g} Hz"
+            raise BadArgument(
+                "control_rate", found, f"a period of whole timesteps, such as at {near}"
+            )
 
     @property
     def pressing(self) -> HoldingMode:
@@ -464,6 +477,9 @@ def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
         raise BadArgument(
             "holding", f"'law' after {closing!r}", "another holding, or a closing under Eq. (25)"
         )
+    if closing == "open_loop" and holding in ("grip", "impedance"):
+        found = f"{holding!r} after 'open_loop', which keeps its squeeze"
+        raise BadArgument("holding", found, "None, or another closing")
     poor = f"one of kind {sensor.kind!r}" + (
         f" with {', '.join(sensor.dead)} dead" if sensor.dead else ""
     )
@@ -472,3 +488,16 @@ def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
         raise BadArgument("sensor", poor, allowed.format(f"closing {closing!r}"))
     if not sensor.full and closing != "open_loop" and holding not in ("force", "position"):
         raise BadArgument("sensor", poor, allowed.format(f"holding {holding!r}"))
+
+
+def check_limit(max_force: float | None, closing: str, holding: str) -> None:
+    """Raise `BadArgument` for a largest force [N] that the modes do not keep.
+
+    The springs of "impedance" add to its forces. Positions alone command no force.
+    """
+    if max_force is None or closing == "open_loop":
+        return
+    blind = holding == "position" and closing in ("position", "paper_position")
+    if blind or holding == "impedance":
+        found = f"{max_force:g} N with closing {closing!r} and holding {holding!r}"
+        raise BadArgument("max_force", found, "None, or holding 'grip' or 'force'")
