@@ -34,7 +34,7 @@ from torchgrasp.foundation.lazy import optimize
 from torchgrasp.foundation.rules import is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
-from torchgrasp.geometry.linalg import dot, matvec, norm
+from torchgrasp.geometry.linalg import UNIT_TOLERANCE, dot, matvec, norm
 from torchgrasp.values.planning import Certificate, Contacts
 from torchgrasp.values.specs import ContactSpec
 
@@ -46,8 +46,6 @@ MAX_RESIDUAL = 1e-6  # largest |W phi| of a balance found by HiGHS, for wrenches
 # tolerance of HiGHS, its least. With its default, 1e-7, margins err by 1e-8 and may cross
 # `MIN_MARGIN`.
 STRICT = 1e-10
-# largest difference of a given normal's length from 1: what rounding in a text file leaves
-UNIT_TOLERANCE = 1e-3
 
 
 @checked(gradients=True)

@@ -37,7 +37,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.contacts.certify import UNIT_TOLERANCE, check_contacts, check_unit
+from torchgrasp.contacts.certify import check_contacts, check_unit
 from torchgrasp.contacts.closure_probability import drawn_contacts, line_posterior
 from torchgrasp.contacts.critical import LeastBalance, least_balance
 from torchgrasp.contacts.form_closure import Vectors, centre_and_radius, with_torque
@@ -47,7 +47,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import LEAST, Force, Length, Range, Seed, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import real
-from torchgrasp.geometry.linalg import dot, eye_like, norm, perpendicular, unit
+from torchgrasp.geometry.linalg import UNIT_TOLERANCE, dot, eye_like, norm, perpendicular, unit
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values.distribution import Distribution, check_within
 from torchgrasp.values.planning import Contacts

@@ -32,8 +32,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector, turned_about
-from torchgrasp.geometry.linalg import dot, norm
-from torchgrasp.geometry.plane import UNIT_ERROR
+from torchgrasp.geometry.linalg import UNIT_TOLERANCE, dot, norm
 from torchgrasp.values.closing import ClosingOptions, choose_options
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import PointCloud
@@ -316,7 +315,7 @@ class GraspController:
             raise BadArgument("observation", told, f"those of the hand, {shape}")
         device = self._sent.joints.device
         check_device("observation", observation.joints.device, "the controller", device)
-        if (up := observation.up) is not None and abs(float(norm(up)) - 1) > UNIT_ERROR:
+        if (up := observation.up) is not None and abs(float(norm(up)) - 1) > UNIT_TOLERANCE:
             found = f"a vector of length {float(norm(up)):g}"
             raise BadArgument("observation.up", found, "a unit vector")
         # what is remembered must stay: a robot may read its sensors into the same memory

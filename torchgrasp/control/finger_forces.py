@@ -17,14 +17,13 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Force, Positive, check_dense, is_known
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.geometry.linalg import dot, norm
+from torchgrasp.geometry.linalg import UNIT_TOLERANCE, dot, norm
 from torchgrasp.hand.drives import joint_stiffness
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps
 
 CHANGED = 1e-3  # change [m] of a fingertip's place that shows another geometry: above rounding
 MOVED = 0.01  # distance [m] of contacts that are no better known ones, but of another frame or unit
-UNIT_ERROR = 1e-3  # largest error of the length of a unit normal
 
 
 @checked
@@ -192,7 +191,7 @@ def _check_reached(hand: Hand, grasps: Grasps) -> None:
     centres = hand.tip_centres(grasps.joints)
     rolled = points + hand.tips.radius[:, None] * normals
     lengths = norm(normals)
-    if bool(((lengths - 1).abs() > UNIT_ERROR).any()):
+    if bool(((lengths - 1).abs() > UNIT_TOLERANCE).any()):
         found = f"vectors of length {float(lengths.min()):g} to {float(lengths.max()):g}"
         raise BadArgument("grasps.contacts.normals", found, "unit vectors")
     behind = dot(centres - points, normals) < 0

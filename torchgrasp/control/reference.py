@@ -19,7 +19,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, Force, Pose, Positive, Range
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.geometry.linalg import norm, unit
+from torchgrasp.geometry.linalg import UNIT_TOLERANCE, norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.drives import drive_stiffness, joint_stiffness
@@ -269,8 +269,6 @@ class ClosingReference(Value):
 class PlanNumbers:
     """Bounds on a closing plan whose parts are in different frames or units."""
 
-    unit: float = 1e-3
-    """Largest error of the length of a unit vector."""
     tilt: float = 0.5
     """Largest angle [rad] between the table and that of the plan: no measurement errs so much."""
     off: float = 0.05
@@ -294,7 +292,7 @@ def check_plan(reference: ClosingReference) -> None:
     if reference.approach is not None:
         lengths["reference.approach"] = norm(reference.approach)[None]
     for name, length in lengths.items():
-        if bool(((length - 1).abs() > PLAN.unit).any()):
+        if bool(((length - 1).abs() > UNIT_TOLERANCE).any()):
             raise BadArgument(name, f"lengths {length.tolist()}", "unit vectors")
     points = reference.gains.target
     if reference.table is not None and reference.planned_table is not None:

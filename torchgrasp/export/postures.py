@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.control.finger_forces import UNIT_ERROR, Squeeze, squeeze
+from torchgrasp.control.finger_forces import Squeeze, squeeze
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.files import format_json
 from torchgrasp.foundation.checks import checked
@@ -19,7 +19,7 @@ from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Force, Pose, Positive
 from torchgrasp.geometry.frames import rotate
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.linalg import UNIT_TOLERANCE, norm
 from torchgrasp.hand.drives import stiff_drives
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
@@ -177,7 +177,7 @@ def _check_executable(hand: Hand, grasps: Grasps) -> None:
     limits.check_limits(grasps.joints.double(), "grasps.joints")
     limits.check_limits(grasps.pregrasp.double(), "grasps.pregrasp")
     off = (norm(grasps.approach.double()) - 1).abs()
-    if bool((off > UNIT_ERROR).any()):
+    if bool((off > UNIT_TOLERANCE).any()):
         found = f"vectors up to {1 + float(off.max()):g} long"
         raise BadArgument("grasps.approach", found, "unit vectors")
 

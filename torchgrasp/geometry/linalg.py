@@ -21,6 +21,8 @@ from torchgrasp.foundation.rules import is_known
 
 Points = Float[Tensor, "n 3"]
 Vector = Float[Tensor, "3"]
+# largest difference of a given unit vector's length from 1: what rounding in a text file leaves
+UNIT_TOLERANCE = 1e-3
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # golden section of the full circle [rad]
 
 

@@ -21,7 +21,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.rules import ANY, Count, is_known
 from torchgrasp.geometry.frames import degenerate, real, virtual_frame
-from torchgrasp.geometry.linalg import dot, norm
+from torchgrasp.geometry.linalg import UNIT_TOLERANCE, dot, norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand
 from torchgrasp.posture_model.gaussian import PARAMETERS, GaussianMixture, map_rows, of_parameters
@@ -39,7 +39,6 @@ DEFAULT_ENERGY = 6.295793622
 """The default greatest energy (no unit) of a code that the hand reaches. It is half the 95 %
 quantile of chi-square with 6 degrees of freedom.
 """
-UNIT_ERROR = 1e-3  # greatest error of a unit normal's length
 # positions, as shares of the joints' ranges, in the postures that identify a hand
 PROBED = (0.2, 0.5, 0.7)
 WRITTEN = 1e-5  # greatest difference [m, or a cosine] of codes written with seven decimals
@@ -87,7 +86,7 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     check_tensor("normals", normals, (len(points), 3, 3))
     lengths = norm(normals)
     error = (lengths - 1).abs()
-    if is_known(lengths) and bool((error > UNIT_ERROR).any()):
+    if is_known(lengths) and bool((error > UNIT_TOLERANCE).any()):
         worst = lengths.flatten()[error.argmax()].item()
         raise BadArgument("normals", f"a normal of length {worst:.6g}", "unit vectors")
     order = torch.tensor(PERMUTATIONS, device=points.device)
