@@ -30,22 +30,22 @@ class ReachNumbers:
     tried: int = 4
     """Number of postures of the library from which a pose is tried."""
     tried_steps: int = 8
-    """Most steps from each of these postures."""
+    """Greatest number of steps from each of the `tried` postures."""
     starts: int = 8
     """Number of postures of the library from which a grasp is tried."""
     steps: int = 12
-    """Most steps from each of these postures."""
+    """Greatest number of steps from each of the `starts` postures."""
     solved: float = 1e-4
-    """Sum of squared errors [mm2] at which a tip has reached its place: (0.01 mm)^2."""
+    """Sum of squared errors [mm2] at which an arm's tip has reached its place: (0.01 mm)^2."""
     way_steps: int = 4
-    """Most steps from one pose of the way to the next."""
+    """Greatest number of steps from one pose of the way to the next."""
     lift: float = 0.1
     """Height [m] of the lift."""
     speed: float = 0.1
     """Speed [m/s] of the tip on the way; a way on which a joint would be too fast is refused."""
     between: int = 8
-    """Interval of the poses along a way at which links are tested for collisions with each other:
-    every eighth.
+    """Number of poses along a way from one test of links for collisions with each other to the
+    next.
     """
     postures: int = 256
     """Number of postures that are compared at a time, which bounds the memory."""

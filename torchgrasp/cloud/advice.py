@@ -25,7 +25,8 @@ class AdviceNumbers:
     """Bounds beyond which a cloud contradicts its camera, its vertical or its table."""
 
     fewest: int = 50
-    """Fewest points that show whether a camera is right, or whether pixels fly off rims."""
+    """Least number of points that show whether a camera is right, or whether pixels fly off rims.
+    """
     narrow: float = 0.06
     """Least width [m] of a level plane that counts as a table left in the cloud."""
     afloat: float = 0.06
@@ -33,19 +34,20 @@ class AdviceNumbers:
     the points just above a table, and things before it hide more.
     """
     level: float = 0.97
-    """Cosine between a table's normal and the vertical, below which advice names the normal."""
+    """Cosine between a table's normal and the vertical, below which advice mentions the normal."""
     down: float = 0.15
-    """Greatest share of visible normals that point down; a camera above a table sees fewer."""
+    """Greatest share of the visible normals that point down without advice. A camera above a table
+    sees fewer.
+    """
     z_up: float = 0.9
-    """Cosine between the upward direction and z, above which the direction counts as z, the
-    default.
+    """Cosine between the upward direction and z above which the direction counts as z, the default.
     """
     along: float = 0.8
-    """Cosine between the camera's ray and an outlier's offset from the others, above which it is a
-    flying pixel.
+    """Cosine between the camera's ray and an outlier's offset from the others, above which the
+    outlier is a flying pixel.
     """
     flying: float = 0.02
-    """Share of flying pixels, over all points, that is worth advice."""
+    """Least number of flying pixels, as a share of all points, that is worth advice."""
 
 
 ADVICE = AdviceNumbers()

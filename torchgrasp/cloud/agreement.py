@@ -23,30 +23,34 @@ class AgreementNumbers:
     """Bounds on how far the cloud, mesh, contacts and table of one object may be apart."""
 
     sunk: float = 0.3
-    """Greatest share of a mesh's height below a table that may have been guessed from a view."""
+    """Greatest share of a mesh's height that may be below a table, which may be a guess."""
     drawn: int = 300
-    """Most points whose distances are measured."""
+    """Greatest number of points whose distances from a mesh or a cloud are measured."""
     drawn_of_cloud: int = 500
-    """Most points of a cloud to which these distances are measured."""
+    """Greatest number of points of a cloud to which these distances are measured."""
     slack: float = 0.01
-    """Greatest distance [m] of points from their mesh, in addition to the noise."""
+    """Greatest distance [m] of points from their mesh, in addition to the noise. Points farther
+    away count as off the mesh.
+    """
     share: float = 0.2
-    """Greatest share of points that may be farther from their mesh."""
+    """Greatest share of points that may be off their mesh."""
     beside: float = 0.0005
     """Greatest median distance [m] of points from their mesh without a warning. The noise and the
     error of the camera's pose are added to it. Views of rendered sensors are nearer to their mesh,
     those of a similar object farther.
     """
     guessed: float = 0.4
-    """Greatest share of contacts that may be farther from their mesh: one of three, on a side that
-    nobody saw.
+    """Greatest share of contacts that may be off their mesh: one of three, on a side that nobody
+    saw.
     """
     astray: float = 0.7
-    """Greatest share of contacts that may be farther from their mesh in simulated trials, where
-    some grasps may miss.
+    """Greatest share of contacts that may be off their mesh in simulated trials, where some grasps
+    may miss.
     """
     levels: int = 8
-    """Number of depths behind each point of a cloud at which a region is sought."""
+    """Number of depths behind each point of a cloud at which a region of allowed contacts is
+    sought.
+    """
     unseen: float = 0.03
     """Greatest distance [m] of contacts from a partial cloud and the space hidden behind it."""
     unseen_share: float = 0.5
@@ -54,7 +58,8 @@ class AgreementNumbers:
     lowest: float = 0.02
     """Share of the points of an object that may be lower than its foot: outliers."""
     foot: float = 0.015
-    """Greatest height [m] of a foot above or below its table, in addition to the noise."""
+    """Greatest height [m] of an object's foot above or below its table, in addition to the noise.
+    """
 
 
 AGREEMENT = AgreementNumbers()
@@ -68,12 +73,14 @@ def check_agreement(
     slack: float,
     share: float,
 ) -> float:
-    """Return the median distance [m] of points from a mesh, or from a cloud and the space behind
-    it. Raise `BadArgument` if too many lie off it.
+    """Return the median distance [m] of `points` from `other`. Raise `BadArgument` if too many are
+    far from it.
 
-    At most the fraction `share` of the `points` (n, 3) [m] may be farther than `slack` [m] from
-    `other`. This is the mesh [m] or the cloud, in the frame of the points. Errors call the argument
-    `name`, and its points `what`.
+    `points` (n, 3) [m] and `other` are in one frame. The distance from a mesh [m] is that from its
+    surface, also for points inside. The distance from a cloud is 0 in the space that its points
+    hide from its camera (`distance_behind`). The error is raised if more than the fraction `share`
+    of the points is farther than `slack` [m]. At most 300 points (`AGREEMENT.drawn`) are measured.
+    In the error's text, `name` is the bad argument, and `what` describes the points.
     """
     points = points.detach().cpu().double()
     points = points[draw_rows(len(points), AGREEMENT.drawn)]

@@ -37,9 +37,11 @@ class RenderNumbers:
     """Parameters of the rendering of a mesh and a table by a virtual camera."""
 
     nearest: float = 1e-3
-    """A mesh has a box in the image only if all of it is farther from the camera than this [m]."""
+    """Least distance [m] of all of a mesh from the camera at which the mesh has a box in the image.
+    """
     margin: float = 1e-2
-    """Width [focal lengths] of the margin about the box of a mesh in the image, for rounding."""
+    """Width [focal lengths] of the margin about the box of a mesh in the image, against rounding.
+    """
     table: float = 0.6
     """Radius [m] of the table."""
 

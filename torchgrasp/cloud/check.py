@@ -34,7 +34,9 @@ class CloudNumbers:
     sensor's resolution.
     """
     line: float = 1e-6
-    """Points are on a line if their second principal spread over the first is less than this."""
+    """Ratio of the second principal spread of the points to the first, below which they are on a
+    line.
+    """
     scene: float = 10.0
     """Greatest extent, read as metres, that is taken for a scene in metres or an object in cm."""
     longest: float = 45.0

@@ -43,26 +43,28 @@ class DepthNumbers:
     farthest: float = 50.0
     """Greatest depth [m] that depth cameras measure."""
     near: float = 0.05
-    """Least share of the measured pixels nearer than `farthest`: fewer are stray ones, and the unit
-    is another.
+    """Least share of the measured pixels that are nearer than `farthest`. If fewer are, they are
+    stray ones, and the unit is another.
     """
     millimetres: float = 200.0
-    """A median depth that is too large for metres is in mm if it is above this, else in cm.
+    """Median depth, too large for metres, above which the depths are in mm; below it they are in
+    cm.
     """
     background: float = 0.05
-    """Least share of pixels with the greatest depth, from which this depth, if too far, marks a
-    background.
+    """Least share of pixels that have the greatest depth. From this share on, a greatest depth that
+    is too far marks a background.
     """
     sampled: int = 5000
     """Number of pixels, about, by which the step of the depths is found."""
     levels: int = 10
-    """Fewest different depths that show a step: one of few faces has fewer."""
+    """Least number of different depths that show their step: an image of few faces has fewer."""
     even: float = 1e-3
     """Greatest error of a depth that is a whole number of steps, over the step."""
     coarse: float = 0.005
     """Least step [m] of the depths for a warning: it is larger than edges of things and noise."""
     several: float = 0.05
-    """Least share of a mask's pixels with one number that may be another object."""
+    """Least share of a mask's pixels with one number for which this number may be another object.
+    """
     viewed: int = 5000
     """Number of points, about, by which a table in the view is compared with the pose."""
     whole: float = 0.5

@@ -48,23 +48,25 @@ class DiagnosisNumbers:
     """Numbers of points that are measured in a cloud, and bounds beyond which there is advice."""
 
     measured: int = 50_000
-    """Most points at which spacing, noise and outliers are measured."""
+    """Greatest number of points at which spacing, noise and outliers are measured."""
     viewed: int = 5000
-    """Most of the measured points that serve the advice on camera, vertical, table and bodies."""
+    """Greatest number of the measured points that serve the advice on camera, vertical, table and
+    bodies.
+    """
     neighbours: int = 9
     """Number of nearest points for the density: the point and a raster's eight neighbours."""
     least: float = 1e-12
     """Least density [1/m2] by which the size of a voxel is found, so that it is finite."""
     long: float = 0.4
-    """Greatest length [m] of an object for a hand."""
+    """Greatest length [m] of an object without advice: a longer one is not for a hand."""
     outliers: float = 0.05
-    """Greatest share of outliers."""
+    """Greatest share of outliers without advice."""
     sparse: float = 0.1
-    """Greatest spacing of the points, over the length."""
+    """Greatest spacing of the points, over the length of the cloud, without advice."""
     noise: float = 0.003
-    """Greatest noise [m]."""
+    """Greatest noise [m] without advice."""
     flipped: float = 0.03
-    """Greatest share of flipped normals."""
+    """Greatest share of flipped normals without advice."""
 
 
 DIAGNOSIS = DiagnosisNumbers()

@@ -47,7 +47,7 @@ class IntrinsicsNumbers:
     """Bounds of the intrinsics that are read, and of what a camera may have."""
 
     most: int = 12
-    """Longest list of numbers: that of a 3 x 4 projection."""
+    """Greatest number of entries of a list of intrinsics: that of a 3 x 4 projection."""
     nested: int = 4
     """Greatest depth of nested objects at which a matrix is found; those of ROS and Zivid have
     two.
@@ -57,24 +57,26 @@ class IntrinsicsNumbers:
     widest: float = 1e6
     """Upper bound of the side of a region of interest [px], and of a binning."""
     shown: int = 8
-    """Most names of a wrong object that an error shows."""
+    """Greatest number of names of a wrong object that an error shows."""
     shown_name: int = 20
-    """Most letters of each name in an error."""
+    """Greatest number of letters of each name in an error."""
     focal: float = 0.15
-    """Least focal length over the side of the image: a view of 147 degrees, wider than any."""
+    """Least focal length over the side of the image. It is a view of 147 degrees, wider than any.
+    """
     unequal: float = 0.05
-    """Greatest difference of fx and fy, over fy, of four numbers in their right order."""
+    """Greatest difference of fx and fy, over fy, at which four numbers count as in the right order.
+    """
     uneven: float = 0.12
     """Difference of fx and fy, over fy, from which a warning is given. Pixels of old cameras differ
     by less, images that were resized to other proportions by more.
     """
     beside: float = 0.1
-    """Greatest shift of the principal point from the middle in four such numbers. It is a share of
-    the side of the image.
+    """Greatest shift of the principal point from the image's middle, over the side, at which these
+    four numbers count so.
     """
     farthest: float = 8.0
-    """Greatest shift of the principal point of a crop from its middle, as a share of the side.
-    Beyond it, the point belongs to another image.
+    """Greatest shift of the principal point of a crop from the crop's middle, as a share of the
+    side. Beyond it, the point belongs to another image.
     """
     corner: float = 0.05
     """Greatest distance by which a crop may reach out of its camera's image, as a share of the
@@ -89,7 +91,7 @@ class IntrinsicsNumbers:
     cropped, and least shift from the middle of the crop. It is over half the side.
     """
     centred: float = 0.05
-    """Greatest shift of the principal point from the middle of a resolution that is guessed, over
+    """Greatest shift of the principal point from the middle of an image whose size is guessed, over
     half the side.
     """
     scaled: float = 2.5
@@ -106,11 +108,11 @@ class IntrinsicsNumbers:
     equal.
     """
     swapped: float = 0.05
-    """Greatest shift of a principal point from the middle whose numbers are swapped, as a share of
-    the side.
+    """Greatest shift of the principal point from the middle, as a share of the side. It counts with
+    cx and cy as they are, and exchanged, to find exchanged ones.
     """
     same_ratio: float = 0.02
-    """Greatest difference of two ratios of sides that count as one."""
+    """Greatest relative difference of two ratios of sides that count as equal."""
 
 
 LIMITS = IntrinsicsNumbers()
@@ -309,11 +311,20 @@ def _is_table(value: object) -> bool:
 
 
 def check_intrinsics(k: Matrix, stated: list[float] | None, size: Sequence[int]) -> None:
-    """Raise `BadArgument` for intrinsics that no camera has, or that are those of another image.
+    """Raise `BadArgument` for intrinsics that no camera has, or that do not belong to an image of
+    this size.
 
-    A `CloudWarning` is given if fx and fy differ by over 12 % (`LIMITS.uneven`). `k` is the matrix
-    [pixels]; `stated` is the [width, height] that came with it, or None. The image has the `size`
-    (h, w) [pixels], and may be a crop.
+    The first are a field of view above 147 degrees, and numbers in a wrong order. The second are a
+    principal point more than 8 sides from the middle, and intrinsics of another resolution. The
+    resolution is right if `stated` is the image's size, or that of a larger image around it.
+    Without `stated`, the principal point shows the resolution. A `CloudWarning` is given if fx and
+    fy differ by over 12 % (`LIMITS.uneven`).
+
+    Args:
+        k: matrix of the intrinsics [pixels].
+        stated: [width, height] [pixels] of the image to which the intrinsics belong, as their
+            source states it; None if it does not.
+        size: (h, w) [pixels] of the image, which may be a crop.
     """
     height, width = size
     (fx, _, cx), (_, fy, cy) = k[:2].tolist()

@@ -47,11 +47,11 @@ class LensNumbers:
     most: float = 1e4
     """Greatest absolute value of a coefficient: no real lens has a larger one."""
     steps: int = 20
-    """Most Newton steps from a pixel to its ray."""
+    """Greatest number of Newton steps from a pixel to its ray."""
     still: float = 1e-6
-    """Step of the search [px] that ends it."""
+    """Length [px] of a step at which the search for a ray ends."""
     same: float = 1e-3
-    """Greatest distance [px] of a ray's image from its pixel."""
+    """Greatest distance [px] of the image of a found ray from its pixel."""
 
 
 LENS = LensNumbers()

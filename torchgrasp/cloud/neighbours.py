@@ -20,15 +20,18 @@ class NeighbourNumbers:
     """Numbers of neighbours of a point, itself included, and parameters of the fits to them."""
 
     spacing: int = 9
-    """Neighbours for the spacing: a raster's eight, more than fly off a rim together."""
+    """Number of neighbours by which the spacing is measured: a raster's eight and the point. More
+    than fly off a rim together.
+    """
     outlier: float = 2.5
-    """A point is an outlier if its mean distance from its neighbours is above this multiple of the
-    median. Depth and slope vary the distance less.
+    """Multiple of the median of the points' mean distances from their neighbours, above which a
+    point is an outlier. Depth and slope vary the distance less.
     """
     plane: int = 25
-    """Neighbours for a plane: about eight for each of its three unknowns."""
+    """Number of neighbours to which a plane is fitted: about eight for each of its three unknowns.
+    """
     quadric: int = 30
-    """Neighbours for a quadric: five for each of its six unknowns."""
+    """Number of neighbours to which a quadric is fitted: five for each of its six unknowns."""
     width: float = 0.7
     """Width of the weights of neighbours, over the distance of the farthest."""
     ridge: float = 1e-3
@@ -36,11 +39,11 @@ class NeighbourNumbers:
     squared errors. It matters only where points are few.
     """
     block: int = 1 << 14
-    """Points whose quadrics are fitted at once: bounds the memory for clouds of any size."""
+    """Number of points whose quadrics are fitted at once, which bounds the memory."""
     flat: int = 2000
-    """Most points by which a cloud is found to be flat."""
+    """Greatest number of points by which a cloud is found to be flat."""
     thin: float = 1e-3
-    """A cloud without noise is flat if its thickness over its length is less than this."""
+    """Thickness over length below which a cloud without noise is flat."""
 
 
 NEAR = NeighbourNumbers()

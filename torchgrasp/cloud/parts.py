@@ -28,27 +28,30 @@ class PartNumbers:
     layer: float = 0.004
     """Least half thickness [m] of a support's layer: a depth camera's noise at half a metre."""
     near: float = 0.02
-    """Points within this distance [m] of the support show its noise."""
+    """Distance [m] from the support within which points show its noise."""
     noises: float = 5.0
-    """Half thickness of the layer, in median distances of the points near the support."""
+    """Half thickness of the support's layer, in median distances of these points from the support.
+    """
     gap: float = 0.04
-    """Least distance [m] between bodies; a bent or hidden surface leaves smaller gaps."""
+    """Least distance [m] between two bodies; a bent or hidden surface leaves smaller gaps."""
     spacings: float = 4.0
-    """Least distance between bodies in spacings of the points, for sparse clouds."""
+    """Least distance between two bodies in spacings of the points, for sparse clouds."""
     share: float = 0.1
     """Least share of the points in a second body; fewer are left over from its cut."""
     lowest: float = 0.02
     """Share of the points of a body that may be lower than its foot: outliers."""
     foot: float = 0.015
-    """A body stands on the ground if its foot is less than this [m] above the lowest point."""
+    """Height [m] of a body's foot above the lowest point of all, below which the body stands on the
+    ground.
+    """
     around: float = 0.5
-    """Greatest distance [m] of an object's points from a place on or near it."""
+    """Greatest distance [m] of an object's points from a given place on or near it."""
     exact: float = 2e-5
     """Greatest median height [m] of a table's points above it in a cloud without noise."""
     thin: float = 0.0005
     """Half thickness [m] of the layer that is a table without noise."""
     fewest: int = 50
-    """Fewest points of a table without noise."""
+    """Least number of points of a table without noise."""
 
 
 PARTS = PartNumbers()

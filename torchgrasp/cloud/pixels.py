@@ -24,15 +24,18 @@ class PixelNumbers:
     """
 
     least: int = 100
-    """Fewest points that show a lattice: a few may be regular by chance."""
+    """Least number of points that show a lattice: few may be regular by chance."""
     probes: int = 500
-    """Most points at which the irregularity is taken."""
+    """Greatest number of points at which the irregularity is taken."""
     neighbours: int = 12
-    """Nearest points of each probe; the noise of depth moves true neighbours apart."""
+    """Number of nearest points of each probe, as the noise of depth moves true neighbours apart."""
     directions: int = 800
-    """Directions over a whole sphere that are tried first; they are about 7 degrees apart."""
+    """Number of directions, over a whole sphere, that are tried first; they are about 7 degrees
+    apart.
+    """
     above: float = 0.1
-    """Least cosine between the direction of a camera and the upward one: it is above the support.
+    """Least cosine between the direction of a camera and the upward one, as a camera is above the
+    support.
     """
     usual: float = 0.6
     """Usual distance [m] of a camera, at which the search begins."""
@@ -41,21 +44,23 @@ class PixelNumbers:
     things hardly show how far the camera is.
     """
     starts: int = 2
-    """Best directions that are refined together."""
+    """Number of the best directions that are refined together."""
     steps: int = 12
     """Number of refinements; each tries a grid of 27 cameras about each of the best."""
     narrow: float = 0.5
-    """Width of the grids, over the first, below which only the best start is refined further."""
+    """Width of a grid of cameras, over that of the first, below which only the best start is
+    refined.
+    """
     narrowing: float = 0.65
-    """Ratio of the widths of one grid and the last."""
+    """Ratio of the width of a grid to that of the grid before."""
     turn: float = 0.1
     """Half width of the first grid [rad] across the direction."""
     stretch: float = 0.5
     """Half width of the first grid in the logarithm of the distance."""
     promising: float = 0.2
-    """Irregularity of the best direction above which no search is worth while."""
+    """Irregularity of the best direction from which on the search is not worth while."""
     regular: float = 0.12
-    """Greatest irregularity of a lattice: of which half the pixels may be missing."""
+    """Greatest irregularity of a lattice, of which half the pixels may be missing."""
     error: float = 3.0
     """Angle [deg] within which the camera of a lattice is likely."""
     block: int = 64

@@ -45,19 +45,23 @@ class PoseNumbers:
     """Bounds beyond which a view contradicts the pose of its camera, or the unit of its depths."""
 
     rounded: float = 0.1
-    """Greatest angle [deg] to the nearest rotation, which is then taken: twice that of three
-    decimals.
+    """Greatest angle [deg] of a matrix from the nearest rotation, which is then taken: twice that
+    of three decimals.
     """
     scaled: float = 1e-4
-    """Greatest difference from orthogonal axes, and of their lengths, of a scaled rotation."""
+    """Greatest deviation of a scaled rotation matrix from orthogonal axes, and greatest relative
+    difference of their lengths.
+    """
     farthest: float = 100.0
-    """A camera farther from the origin [m] has a pose that is not in metres."""
+    """Greatest distance [m] of a camera from the origin: a pose with a greater one is not in
+    metres.
+    """
     farthest_table: float = 10.0
-    """A table farther from the origin along its normal [m] has a pose that is not in metres. A
-    camera so far off gives a note.
+    """Greatest distance [m] of a table from the origin along its normal. A pose with a greater one
+    is not in metres. A camera so far off gives a note.
     """
     millimetres: float = 200.0
-    """A position that is too far is in mm if a coordinate is above this, else in cm."""
+    """Coordinate of a position that is too far, above which it is in mm; else it is in cm."""
     shallow: float = 0.15
     """Least median depth [m] of a view in which a table should have been found."""
     deep: float = 4.0
@@ -69,20 +73,26 @@ class PoseNumbers:
     upright: float = 2.0
     """Greatest roll [deg] of a camera that stands upright, as most do."""
     turn: float = 0.985
-    """A rotation is nearly none if the diagonal of its matrix is above this: about 10 degrees."""
+    """Least entry on the diagonal of a rotation matrix above which it is nearly the identity: about
+    10 degrees.
+    """
     shift: float = 0.1
-    """A shift below this [m] is nearly none: the colour camera stands beside the depth camera."""
+    """Length [m] of a shift below which it is nearly none: the colour camera stands beside the
+    depth camera.
+    """
     high: float = 4.0
     """Greatest height [m] of a camera above the table if the unit of the depth is assumed."""
     highest: float = 10.0
     """Greatest height [m] of a camera above the table if the unit of the depth is given."""
     wall: float = 0.5
-    """Cosine between a normal and z below which a plane beside a level support is a wall."""
+    """Component along z of the normal of a plane, beside a level support, below which the plane is
+    a wall.
+    """
     tilt: float = 3.0
     """Greatest tilt of a table [deg] that needs no explanation."""
     level: float = 5.0
-    """Another pose is suggested if with it the table tilts by less than this [deg]. It must also
-    tilt less than a third as much as now.
+    """Tilt of a table [deg] below which another pose, with which the table tilts so little, is
+    suggested. It must also tilt less than a third as much as now.
     """
     told: float = 5.0
     """Least tilt of a table [deg] for a note."""
@@ -91,17 +101,20 @@ class PoseNumbers:
     this, the camera hangs upside down. With such a component along x it lies on its side.
     """
     sloped: float = 15.0
-    """A table tilted by less than this [deg], or as far from upside down, may be a slope."""
+    """Tilt of a table [deg], from upright or from upside down, below which the table may be a
+    slope.
+    """
     drawn: int = 20_000
     """Number of points, about, by which a given table is found to be seen."""
     on_table: float = 0.03
-    """Points on the table are within this distance of it [m]."""
+    """Greatest distance [m] from the table of points that count as on it."""
     seen: float = 0.001
-    """Share of all points on a given table from which the camera counts as having seen it."""
+    """Least share of all points on a given table at which the camera counts as having seen it."""
     lowest: float = 0.01
     """Share of the points that may be lower than all of the objects."""
     above: float = 0.5
-    """A given table without points on it is wrong if it is farther than this [m] below all points.
+    """Height [m] of all points above a given table, without points on it, beyond which the table is
+    wrong.
     """
 
 
@@ -110,39 +123,51 @@ class SizeNumbers:
     """Bounds on heights of a camera and sizes of objects [m] by which a depth's unit is checked."""
 
     points: int = 100
-    """Fewest points of an object whose size counts."""
+    """Least number of points of an object whose size counts."""
     smaller: int = 5
-    """One object in this number may be smaller than the size that is compared with the bounds."""
+    """Reciprocal of the share of objects that may be smaller than the size that is compared with
+    the bounds.
+    """
     low_table: float = -0.5
-    """A table below this [m] may be one that a wrong unit moved down."""
+    """Offset [m] of a table along its normal below which a wrong unit may have moved it down."""
     near: float = 0.005
-    """Greatest difference [m] of a camera's height from that of a known wrong unit. A greater one
-    refuses right poses in the frame of a camera's start, which is near the camera.
+    """Greatest difference [m] of a camera's height from the height that a known wrong unit gives. A
+    greater bound would refuse right poses in the frame of a camera's start, which is near the
+    camera.
     """
     units: tuple[float, ...] = (0.25, 0.1)
-    """Millimetres of one count of the depth that are often read as one millimetre."""
+    """Numbers of millimetres in one count of the depth that are often read as one millimetre."""
     high: float = 1.0
-    """A camera above this [m] is high: a note says so, and the sizes of objects are checked."""
+    """Height [m] of a camera above which it is high: a note says so, and the sizes of objects are
+    checked.
+    """
     large_scaled: float = 0.12
-    """Objects larger than this [m] are too large if the table's height is that of a wrong unit."""
+    """Size [m] of objects above which they are too large, if the table's height is that of a wrong
+    unit.
+    """
     higher: float = 1.5
     """Height [m] of a camera above which some objects must be smaller than `large`."""
     large: float = 0.2
-    """Objects larger than this [m] are too large under a camera higher than `higher`."""
+    """Size [m] of objects above which they are too large under a camera higher than `higher`."""
     furniture: float = 0.6
-    """An object whose box has a longer diagonal [m] is furniture: its support is no table."""
+    """Diagonal [m] of the box of an object from which on it is furniture: its support is no table.
+    """
     ends: float = 0.02
-    """Share of an object's points at each end along an axis that may fly, and do not count."""
+    """Share of an object's points, at each end along an axis, that may be flying pixels and do not
+    count.
+    """
     huge: float = 0.5
-    """Objects larger than this [m] are too large under any high camera."""
+    """Size [m] of objects above which they are too large under any high camera."""
     low: float = 0.12
     """Height [m] of a camera below which some object must be larger than `small`."""
     close: float = 0.2
     """Height [m] of a camera below which a note names the unit, if all objects are tiny."""
     tiny: float = 0.05
-    """Objects smaller than this [m] are tiny: counts of 1/256 m give them, read as millimetres."""
+    """Size [m] of all objects below which they are tiny: counts of 1/256 m give them, read as
+    millimetres.
+    """
     small: float = 0.03
-    """Objects that are all smaller than this [m] are too small under a camera lower than `low`."""
+    """Size [m] of all objects below which they are too small under a camera lower than `low`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,12 +185,12 @@ class LayerNumbers:
     below: float = 0.5
     """Greatest height [m] of the layer above the table."""
     share: float = 0.2
-    """Least share of all points in the layer."""
+    """Least share of all points that lie in the layer."""
     own: float = 0.25
-    """Greatest share of points on the table, over the share of the layer."""
+    """Greatest share of all points that lie on the given table, over the share in the layer."""
     standing: float = 0.01
-    """Least share of points that are higher than a layer above the table. Over the flat top of an
-    object there are none.
+    """Least share of all points that are higher than a layer above the table. Over the flat top of
+    an object there are none.
     """
 
 

@@ -41,13 +41,15 @@ class PrepareNumbers:
     """Bounds on the views of a cloud, and on the distance to which points are moved."""
 
     views: int = 16
-    """Most cameras of a cloud."""
+    """Greatest number of cameras of a cloud."""
     points: int = 10
-    """Fewest points of each view."""
+    """Least number of points of each view."""
     moved: float = 4.5
-    """Points farther from the fit, in medians of its errors, are beyond Gaussian noise."""
+    """Greatest distance of a kept point from the quadric fitted to its neighbours, in medians of
+    the fits' rms errors. Gaussian noise stays within it.
+    """
     least: float = 1e-12
-    """A distance [m] that counts as 0, where a fit has no error."""
+    """Distance [m] from the fit that counts as 0, where a fit has no error."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,30 +59,36 @@ class NormalNumbers:
     neighbours: int = 9
     """Number of nearest points: the point itself and eight neighbours, enough for a majority."""
     edge: float = 0.7
-    """Signs are not compared below this |cosine|: across an edge of 45 degrees."""
+    """|Cosine| of two normals below which their signs are not compared: across an edge of 45
+    degrees.
+    """
     over: float = 0.3
-    """Signs are not compared with a neighbour whose height over the tangent plane, over its
-    distance, is above this. Such a neighbour is behind a thin wall.
+    """Height of a neighbour over the tangent plane, over its distance, above which signs are not
+    compared. Such a neighbour is behind a thin wall.
     """
     pairs: int = 20
-    """Fewest pairs of neighbours that count; of fewer any share may be chance."""
+    """Least number of compared pairs of neighbours: of fewer any share may be chance."""
     random: float = 0.35
-    """Signs of which this share is opposed are not trusted; random ones oppose half."""
+    """Share of opposed signs from which on the signs are not trusted; of random ones half are
+    opposed.
+    """
     rounded: float = 1e-3
-    """Greatest error of a unit length: text files round to three digits."""
+    """Greatest error of the length of a unit normal: text files round to three digits."""
     across: float = 0.7
     """Least median |cosine| between normals and planes fitted to the points. Random directions have
     a half; normals have more, also of few and noisy points.
     """
     alike: float = 0.999
-    """Least cosine of nearly all vectors with their median if they are alike, as one colour is."""
+    """Least cosine of nearly all vectors with their median at which they are alike, as one colour
+    is.
+    """
     nearly: float = 0.9
-    """Share of the vectors that are nearly all."""
+    """Share of the vectors that counts as nearly all of them."""
     drawn: int = 2000
-    """Most points at which normals are compared with these planes."""
+    """Greatest number of points at which normals are compared with planes fitted to the points."""
     inward: float = 0.05
-    """Mean cosine between normals and the way to the middle, weighted with its length. Above this,
-    normals point inward; in a flat view it is 0.
+    """Mean cosine between the normals and the directions to the middle, weighted with the distance.
+    Above this, normals point inward; in a flat view it is 0.
     """
 
 

@@ -15,20 +15,22 @@ from torchgrasp.geometry.linalg import Points, unit
 
 @dataclasses.dataclass(frozen=True)
 class RayNumbers:
-    """Parameters of the search for depths that are distances from the camera, or inverse depths."""
+    """Parameters of the test whether depths are distances from the camera along its rays."""
 
     near: float = 0.005
-    """Greatest distance [m] of points from a plane on which they lie."""
+    """Greatest distance [m] from a plane of points that count as on it."""
     drawn: int = 5000
     """Number of points, about, to which planes are fitted."""
     patches: int = 4
-    """Patches along a side of the image at which the search for a plane starts."""
+    """Number of patches along a side of the image; in each, the search for a plane starts."""
     fewest: int = 20
-    """Fewest points to which a plane is fitted."""
+    """Least number of points to which a plane is fitted."""
     fits: int = 4
     """Number of fits, each to the points near the plane of the fit before."""
     better: float = 1.3
-    """Least share of points on the plane, over the share with the depths as they are."""
+    """Least share of points on planes if the depths are distances, over that with the depths as
+    they are.
+    """
 
 
 RAYS = RayNumbers()

@@ -41,31 +41,35 @@ class ReadNumbers:
     """Bounds by which the arrays of a file are understood."""
 
     shown: int = 200
-    """Most letters of the names of columns in a note."""
+    """Greatest number of letters of the names of columns in a note."""
     lines: int = 3
-    """Most lines of a header in notes."""
+    """Greatest number of lines of a header in notes."""
     unit: float = 1e-4
-    """Greatest error of the unit length of a table's normal."""
+    """Greatest error of the length of a table's unit normal."""
     near_unit: float = 0.05
     """Greatest error of the length of a normal in columns 4 to 6."""
     normals: float = 0.9
-    """Least share of lines with such a length by which columns 4 to 6 are normals."""
+    """Least share of rows with such a length at which columns 4 to 6 are normals."""
     drawn: int = 2000
-    """Most points by which a camera in the origin is judged."""
+    """Greatest number of points by which a camera in the origin is judged."""
     fitted: float = 0.7
-    """Least median cosine between normals and planes fitted to points: others are colours."""
+    """Least median cosine between normals and planes fitted to points: with less they are colours.
+    """
     alike: float = 0.999
-    """Least cosine of nearly all normals with their median if they are alike, as one colour is."""
+    """Least cosine of nearly all normals with their median at which they are alike, as one colour
+    is.
+    """
     across: float = 0.1
     """Quantile of the cosines with fitted planes that must be as large if all normals are alike."""
     searched: int = 1000
-    """Rows, about, among which a point that stands for missing pixels is sought."""
+    """Number of rows, about, among which a point that stands for missing pixels is sought."""
     fewest: int = 100
-    """Fewest rows that can have such a point."""
+    """Least number of rows that can have such a point."""
     repeated: float = 0.05
     """Least share of these rows that hold such a point."""
     usual: float = 0.9
-    """Quantile of the numbers of equal rows that counts as usual: clouds may hold copies of points.
+    """Quantile of the numbers of equal rows that counts as the usual number, as clouds may hold
+    copies of points.
     """
     more: float = 5.0
     """Least number of rows with such a point, over the usual number of equal rows."""

@@ -21,11 +21,12 @@ class LiveCameraNumbers:
     """Parameters of the shot of a live camera."""
 
     settle: int = 30
-    """Frames that are dropped first: the exposure settles within a second, of 30 frames."""
+    """Number of frames that are dropped first: the exposure settles within a second, of 30 frames.
+    """
     frames: int = 9
-    """Frames whose median is taken: the noise of single pixels falls to about a third."""
+    """Number of frames whose median is taken: the noise of single pixels falls to about a third."""
     queue: int = 2
-    """Frames that wait in the queue; more would be old ones."""
+    """Number of frames that wait in the queue; more would be old ones."""
     patience: int = 5000
     """Longest wait for a frame [ms]; a camera that starts needs up to 2 s."""
 

@@ -35,65 +35,73 @@ class ViewDistanceNumbers:
     """Bounds on how far the views of one object may be apart."""
 
     drawn: int = 400
-    """Most points of a view that are compared with another view."""
+    """Greatest number of points of a view that are compared with another view."""
     surface: int = 5000
-    """Most points of the surface that they are compared with."""
+    """Greatest number of points of the other view's surface with which they are compared."""
     reach: float = 1.5
-    """Greatest distance, along the surface, of two points that are compared, in spacings of the
+    """Greatest distance of compared points of two views along the surface, in spacings of the
     surface's points.
     """
     least: int = 20
-    """Fewest compared points that count: fewer are a rim that flies."""
+    """Least number of compared points: fewer are a rim of flying pixels."""
     seen: float = 0.9
-    """Quantile of the heights of points in front of a surface that counts as their height; flying
+    """Quantile of the heights of points in front of a surface that counts as their height. Flying
     pixels are higher.
     """
     same: float = 0.8
-    """Least cosine of two normals of one surface."""
+    """Least cosine of two normals that count as of one surface."""
     refused: float = 2.5
-    """Greatest distance of two views along their normals, over their noise."""
+    """Greatest distance of two views along their normals, in multiples of their noise. Views with a
+    greater one are refused.
+    """
     shifted: float = 3.0
-    """Greatest shift of a view, or height before what another saw, over their noise."""
+    """Greatest shift of a view, or height of a view before what another camera saw, in multiples of
+    their noise.
+    """
     likely: float = 1.0
+    """Chi squared of a motion from which on it widens the standard deviations of the poses."""
     shown: float = 4.0
-    """Least chi squared of a motion that widens the standard deviations, and of one that is
-    reported, corrected or refused. Below the second, noise and bias of the cameras explain it.
+    """Chi squared of a motion from which on it is reported, corrected or refused. Below it, noise
+    and bias of the cameras explain the motion.
     """
     vague: float = 1.5
-    """Factor of the limits for a view without a camera, whose noise is a guess."""
+    """Factor on the limits for a view without a camera, whose noise is a guess."""
     meet: float = 0.05
     """Least share of a view's points that must lie on the other view, or behind it."""
     gap: float = 0.03
-    """Greatest distance [m] at which a point still counts as lying there."""
+    """Greatest distance [m] at which a point still counts as on the other view, or behind it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RegistrationNumbers:
-    """Parameters of the search for the motion that brings two views together."""
+    """Parameters of the search for the motion that brings two views together (registration)."""
 
     shifted: float = 0.01
+    """Standard deviation [m] of the positions of given poses. What the overlap of the views does
+    not show stays as given.
+    """
     turned: float = 0.1
-    """Standard deviations of poses [m, rad]: what the overlap does not show stays as given."""
+    """Standard deviation [rad] of the rotations of given poses."""
     repeated: float = 20.0
-    """Points that share one error: a camera's bias is smooth."""
+    """Number of points that share one error, because the bias of a camera is smooth."""
     first: float = 0.04
-    """Greatest distance [m] of matching points at first."""
+    """Greatest distance [m] of matching points in the first step."""
     shrink: float = 0.8
-    """Factor of this distance from step to step."""
+    """Factor by which this distance shrinks from step to step."""
     last: float = 4.0
-    """Greatest distance of matching points in the end, over the noise."""
+    """Greatest distance of matching points in the last steps, in multiples of the noise."""
     steps: int = 25
-    """Most steps."""
+    """Greatest number of steps of the search."""
     still: float = 1e-4
-    """Change [m, rad] below which the search ends."""
+    """Greatest change [m, rad] of the motion in a step at which the search ends."""
     hidden: float = 0.9
-    """Greatest share of a motion's variance that the overlap does not show."""
+    """Greatest share that may be assumed of a motion's variance which the overlap does not show."""
     gaussian: float = 1.4826
-    """Ratio of a standard deviation to the median absolute value."""
+    """Ratio of the standard deviation to the median absolute value of a normal distribution."""
     shift: float = 0.05
-    """Greatest shift [m] that is corrected: matching points are to be found."""
+    """Greatest shift [m] that is corrected, so that matching points can be found."""
     turn: float = 20.0
-    """Greatest rotation [deg] that is corrected: normals are to match."""
+    """Greatest rotation [deg] that is corrected, so that normals match."""
 
 
 VIEWS = ViewDistanceNumbers()
@@ -102,16 +110,20 @@ MOTION = RegistrationNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """The rigid motion after which a view agrees best with another one, and how far the views were
-    apart before.
+    """The rigid motion of a view after which it agrees best with another view.
+
+    It also says how far the views were apart before. It is the result of the registration of the
+    two views. Root mean squares (rms) are over the points of the moved view.
     """
 
-    pose: Float[Tensor, "4 4"]  # new_from_old [m]
-    shift: float  # length of the shift of the points' mean [m]
-    distance: float  # rms distance [m] over the points, along their normals
-    unsure: float  # rms distance [m] that the overlap does not show, estimated from the shown one
-    left: float  # deviation [m] of the points from the other view after the motion
-    chi_squared: float  # of the motion: small if noise and bias explain it (no unit)
+    pose: Float[Tensor, "4 4"]  # the motion new_from_old (4, 4) [m], in the frame of the two views
+    shift: float  # distance [m] by which the mean of the view's points moves
+    distance: float  # rms distance [m] by which the points move along their normals
+    # rms distance [m] of a motion that the overlap does not show, estimated from the shown one
+    unsure: float
+    left: float  # robust standard deviation [m] of the points from the other view after the motion
+    # chi squared of the motion (no unit): small if noise and bias of the cameras explain it
+    chi_squared: float
 
     @property
     def error(self) -> float:

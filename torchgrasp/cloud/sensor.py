@@ -34,20 +34,30 @@ class FaultNumbers:
     background: float = 100.0
     """Depth [m] that is assumed for a pixel in which nothing is measured."""
     width: int = 5
-    """A rim pixel has the other surface within two pixels: in a square of this side [px]."""
+    """Side [px] of the square about a pixel that is searched for another surface. A pixel with one,
+    so within two pixels, is at a rim.
+    """
     jump: float = 0.010
-    """Least difference in depth [m] between the two surfaces at a rim."""
+    """Least difference in depth [m] between the two surfaces at a rim. A smaller one is not a jump.
+    """
     corner: float = 8.0
-    """Width of the surroundings [px] whose light reaches a corner."""
+    """Standard deviation [px] of the Gaussian blur that gives the mean depth around a pixel. Light
+    from these surroundings reaches a corner.
+    """
     deepest: float = 0.01
-    """Greatest depth [m] of a corner behind its surroundings; a deeper pixel is no corner."""
+    """Greatest depth [m] of a pixel behind this mean at which it counts as in a corner."""
     beside: int = 3
-    """Width [px] of the window in which a pixel is compared with those beside it, for edges."""
+    """Side [px] of the square about a pixel in which a jump of depth makes it an edge. The square
+    holds the pixel and its direct neighbours.
+    """
     fine: float = 0.5
-    """Width [px] of patches of fine noise: neighbours are alike, and the next ones hardly."""
+    """Standard deviation [px] of the Gaussian blur of the noise `SensorNoise.fine`. With it, the
+    noise of adjacent pixels is similar, and that of pixels farther apart is nearly independent.
+    """
     spread: float = 0.2
-    """Share of the difference to each neighbour that a step of smoothing takes away. It is stable
-    below a quarter. Each step adds twice this share to the variance [px^2].
+    """Share of the depth difference to each neighbour that a step of smoothing takes away. Below a
+    quarter the steps are stable. Each step adds twice this share to the variance [px^2] of the
+    blur.
     """
 
 
@@ -56,21 +66,23 @@ class EstimateNumbers:
     """Parameters of the estimate of a depth camera's noise from a table, or from depth errors."""
 
     patch: int = 21
-    """Side [px] of the patches whose mean error is the bias."""
+    """Side [px] of the square patches whose mean error is the camera's bias."""
     least: int = 1000
-    """Fewest pixels that show the noise of a table."""
+    """Least number of pixels that show the noise of a table."""
     near: float = 0.02
-    """Pixels farther from the plane than this [m] do not count."""
+    """Distance [m] of a pixel from the table beyond which it does not count."""
     full: float = 0.9
-    """Least share of a patch on the table: others are at the feet of objects."""
+    """Least share of the pixels of a patch that are on the table. Other patches are at the feet of
+    objects.
+    """
     least_share: float = 1e-9
-    """Least share of a patch, so that the mean of an empty patch is finite."""
+    """Least share of a patch that is a divisor, so that the mean of an empty patch is finite."""
     errors: int = 100
-    """Fewest errors to which a model is fitted."""
+    """Least number of depth errors to which a model of the noise is fitted."""
     groups: int = 8
-    """Groups of depths whose spread is fitted."""
+    """Number of groups of similar depths to whose standard deviations the model is fitted."""
     gaussian: float = 1.4826
-    """Standard deviation over the median absolute deviation of Gaussian errors."""
+    """Ratio of the standard deviation to the median absolute deviation of Gaussian errors."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,15 +90,21 @@ class StillNumbers:
     """Bounds by which frames show that camera and scene stood still."""
 
     off: float = 0.02
-    """A pixel differs if it is off by more than this, as a share of its depth."""
+    """Deviation of a pixel from the median of the frames, as a share of its depth, beyond which it
+    differs.
+    """
     share: float = 0.05
-    """Greatest share of pixels that differ; noise and flying pixels change fewer."""
+    """Greatest share of pixels that differ, if the camera stood still. Noise and flying pixels
+    change fewer.
+    """
     side: int = 8
-    """Side [px] of the patches whose medians are compared, too: they have less noise."""
+    """Side [px] of the patches whose median depths are compared, too: these have less noise."""
     patch_off: float = 0.015
-    """A patch differs if its median is off by more than this, as a share of its depth."""
+    """Deviation of the median depth of a patch, as a share of its depth, beyond which it differs.
+    """
     patch_share: float = 0.01
-    """Greatest share of patches that differ: the rims of objects, and bias."""
+    """Greatest share of patches that differ, if the camera stood still: rims of objects, and bias.
+    """
 
 
 FAULTS = FaultNumbers()

@@ -19,27 +19,27 @@ class SurroundingNumbers:
     layer: float = 0.004
     """Half thickness [m] of a table's layer: a depth camera's noise at half a metre."""
     risen: float = 0.015
-    """Least height [m] of an object's points above the table that count."""
+    """Least height [m] above the table of points that count as the object's."""
     fewest: int = 20
-    """Fewest such points, and fewest points of the table."""
+    """Least number of these points, and least number of points on the table."""
     beyond: float = 0.02
-    """Least distance [m] of the table's points from the object's outline, seen from above: a foot
-    is hardly wider than the rest.
+    """Distance [m] from the object's outline, seen from above, beyond which points on the table
+    count. A foot is hardly wider than the rest.
     """
     share: float = 0.1
-    """Least share of all points that are on the table and so far from the object."""
+    """Least share of all points that are on the table and so far from the outline."""
     sectors: int = 12
-    """Equal sectors around the object, seen from above."""
+    """Number of equal sectors around the object, seen from above."""
     sides: float = 0.55
     """Least share of the sectors with points of the table: the object hides some, and legs
     lie on fewer.
     """
     planes: int = 64
-    """Planes through points that are tried where the table is unknown."""
+    """Number of planes, each through one point, that are tried where the table is unknown."""
     fits: int = 3
-    """Fits of the best of these planes to the points near it."""
+    """Number of fits of the best of these planes, each to the points near it."""
     below: float = 0.02
-    """Greatest share of points below such a plane: below a table nothing is seen."""
+    """Greatest share of points clearly below such a plane: below a table nothing is seen."""
 
 
 SURROUNDINGS = SurroundingNumbers()

@@ -17,18 +17,18 @@ from torchgrasp.geometry.support_search import find_supports
 
 @dataclasses.dataclass(frozen=True)
 class UnseenNumbers:
-    """Bounds beyond which a camera cannot have seen the points of a view."""
+    """Bounds beyond which a camera cannot have seen the points of a view from its viewpoint."""
 
     edge_on: float = 0.15
-    """Greatest share of points that a camera sees edge-on."""
+    """Greatest share of points that the camera sees edge-on."""
     behind: float = 0.2
     """Greatest share of points that lie behind others."""
     grazing: float = 0.17
-    """A surface is seen edge-on if the cosine between ray and normal is below this: 80 degrees."""
+    """Cosine between ray and normal below which a surface is seen edge-on: 80 degrees."""
     neighbours: int = 6
     """Number of nearest points in the image with which a point is compared, itself included."""
     slope: float = 2.0
-    """Slopes up to this, depth over width, hide nothing."""
+    """Greatest slope of a surface, depth over width, that hides nothing."""
     step: float = 0.1
     """Least step of depth behind which points are hidden, over the radius of the cloud."""
 
@@ -48,40 +48,44 @@ class GuessNumbers:
     """
 
     drawn: int = 2000
-    """Most points from which the camera is guessed."""
+    """Greatest number of points from which the camera is guessed."""
     half_view: float = 50.0
-    """Points of a camera in the origin are at most this far from its axis [deg]."""
+    """Greatest angle [deg] of the points from z, at which the camera may be in the origin."""
     ahead: float = 0.6
-    """Least cosine between z and the way to the middle of the points. It is that of a camera in the
-    origin that looks along z; else z may be up.
+    """Least cosine between z and the direction to the mean of the points. With less, no camera in
+    the origin looks along z, and z may be up.
     """
     far: float = 2.0
-    """A cloud whose camera is in the origin is farther from it than this, in radii of the cloud."""
+    """Least distance of a cloud from a camera in the origin, in radii of the cloud."""
     directions: int = 400
-    """Directions that are tried; they are about 10 degrees apart."""
+    """Number of directions of the camera that are tried; they are about 10 degrees apart."""
     above: float = 0.1
-    """Least cosine between a direction and the vertical: a camera is above the support."""
+    """Least cosine between such a direction and the vertical, as a camera is above the support."""
     distance: float = 4.0
-    """Distance of a guessed camera, in radii of the cloud."""
+    """Distance of a guessed camera from the centre of the cloud, in radii of the cloud."""
     density: float = 3.0
     """Weight of the density in the score; that of the bulge is 1. It gave the fewest wrong cameras.
     """
     rival: float = 0.3
-    """Directions whose score is less than this below the best are likely, too."""
+    """Difference of score from the best direction up to which another direction is likely, too."""
     least_angle: float = 15.0
-    """Least angle [deg] within which a camera is likely."""
+    """Least angle [deg] about the guessed direction within which the camera is likely."""
     sure: float = 1.0
     """Least score of a direction that the points show clearly."""
     better: float = 0.5
-    """A view was not taken from a place whose score is this much below the best."""
+    """Difference of score from the best camera position from which on a view was not taken from a
+    place.
+    """
     tangent: float = 0.3
-    """Surfaces with a smaller cosine to the ray count less for the bulge, as noise turns them."""
+    """Cosine between ray and normal below which a surface counts less for the bulge, as noise turns
+    its normals.
+    """
     neighbours: int = 13
     """Number of nearest points, the point itself included; the farthest measures the density."""
     least_cosine: float = 0.1
     """Least cosine between ray and normal for the density, which noise would make infinite."""
     least: float = 1e-12
-    """Least value of a divisor, and of a number whose logarithm is taken."""
+    """Least value of a divisor, and of a number whose logarithm is taken, against infinity."""
 
 
 UNSEEN = UnseenNumbers()

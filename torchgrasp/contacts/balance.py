@@ -76,12 +76,12 @@ class BalanceNumbers:
     near: int = 24
     """Number of changes of the pairs' weights that each round of the short search tries."""
     near_radii: tuple[float, ...] = (0.5, 0.28, 0.15)
-    """Lengths of the longest changes in the rounds of the short search."""
+    """Lengths of the longest changes of these weights, one for each round of the short search."""
     near_least: float = 0.3
     """Length of the shortest change in a round, as a share of the longest."""
     slack: float = 0.04
-    """Friction that four or five contacts may need beyond the least coefficient, for more even
-    forces.
+    """Coefficient of friction that four or five contacts may need beyond the least one, for more
+    even forces.
     """
     least_preferred: float = 0.05
     """Least preferred normal force, as a share of the largest: every finger has to push."""

@@ -57,13 +57,15 @@ class CriticalNumbers:
     exact: float = 1e-6
     """The last nu: the result is larger than the critical friction by about 2 nu a contact."""
     steps: int = 50
-    """Most steps; most contact sets need fewer than 15."""
+    """Greatest number of steps of the method; most contact sets need fewer than 15."""
     first: float = 1.5
-    """The first friction coefficient, as a multiple of what the first forces need."""
+    """Multiple of the friction that the first forces need, for the first friction coefficient."""
     above: float = 0.2
-    """Added to the first friction coefficient."""
+    """Number that is added to this multiple."""
     pushing: float = 0.05
-    """Least normal force of first forces that balance; otherwise the first forces are normal."""
+    """Least normal force of first forces that balance. If one is less, the first forces are along
+    the normals.
+    """
     within: float = 0.9
     """Share of the way to the edge of the cones that a step goes at most."""
     shorter: tuple[float, ...] = (1.0, 0.8, 0.5, 0.2, 0.05)
@@ -73,9 +75,9 @@ class CriticalNumbers:
     undone.
     """
     short: float = 0.3
-    """A step with a lesser share is short: the next one keeps mu and nu."""
+    """Share of a step below which it is short: the next one keeps mu and nu."""
     stuck: float = 0.05
-    """If a step that keeps mu has a lesser share, mu is too small for any balanced forces."""
+    """Share of a step that keeps mu, below which mu is too small for any balanced forces."""
     raised: float = 1.5
     """Factor by which mu then grows, so that steps come free of the cones' edges."""
     off: float = 0.1

@@ -93,13 +93,15 @@ def scaled_arms(points: Vectors) -> Vectors:
 
 
 def tangents(points: Vectors, normals: Vectors) -> Vectors:
-    """Return a unit tangent (b, f, 3) at each contact; the first edge of the linearised friction
-    cone leans along it.
+    """Return a unit tangent (b, f, 3) of the surface at each contact. The first edge of the
+    linearised friction cone leans along it.
 
-    The tangent rotates with the object. With three contacts it lies in their plane. With four or
-    five, it lies in the plane of three of them. Their plane is most perpendicular to the tangent
-    plane, weighted by the area of their triangle. The tangent is arbitrary where no plane gives one
-    and friction cannot give closure. `points` and outward unit `normals` have the shape (b, f, 3).
+    `points` and outward unit `normals` have the shape (b, f, 3), for f contacts in each of b sets.
+    With three contacts the tangent lies in the plane through them. With four or five, each contact
+    has its own choice among the planes through any three contacts. The choice has the greatest
+    product of the triangle's area and the sine of its angle to the tangent plane. So the tangent
+    rotates with the object. Where no plane gives a tangent, it points towards another contact, if
+    possible. Otherwise it is arbitrary, and friction cannot give closure.
     """
     corners = subsets(points.shape[1], 3, points.device)
     first, second, third = (points[:, corner] for corner in corners.unbind(1))

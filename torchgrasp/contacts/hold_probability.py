@@ -59,7 +59,9 @@ TILTS = Range(0.0, math.pi)
 
 @dataclasses.dataclass(frozen=True)
 class HoldProbabilityNumbers:
-    """Parameters of `hold_probability`."""
+    """Parameters of `hold_probability`, the probability that contacts hold an object despite
+    errors.
+    """
 
     points: int = 64
     """Number of samples of the errors around which the critical friction is found and linearised.
@@ -69,15 +71,19 @@ class HoldProbabilityNumbers:
     the critical friction has a kink, the result is too high by about as much.
     """
     rows: int = 2**15
-    """Rows, contact sets with one error each, that are computed at a time: this bounds memory."""
+    """Number of contact sets with one error each (rows) that are computed at a time, which bounds
+    the memory.
+    """
     narrow: float = 1e-4
-    """An interval shorter than this, in standard deviations, counts as its middle. The difference
-    of Psi would be lost in rounding.
+    """Length of an interval, in standard deviations, below which it counts as its middle. The
+    difference of Psi would be lost in rounding.
     """
     parts: int = 2**20
-    """Pairs of a contact set and a part of the distribution that are computed at a time."""
+    """Number of pairs of a contact set and a part of the distribution that are computed at a time.
+    """
     farthest: float = 2.0
-    """Largest distance [m] of a centre of mass from the contacts: no hand carries larger things."""
+    """Greatest distance [m] of a centre of mass from the contacts: no hand carries larger things.
+    """
     masses: int = 9
     """Number of ranges of an uncertain mass, in each of which the critical friction is linear."""
 

@@ -279,13 +279,10 @@ Bounds = tuple[Float[Tensor, "b k"], Float[Tensor, "b k u"]]
 
 
 class Face(NamedTuple):
-    """A plane at which a table ends, in normalised units.
+    """A plane at which a table ends, its top or its side, in normalised units."""
 
-    `outward` is its unit normal, away from the table, and `offset` its distance from the origin.
-    """
-
-    outward: Float[Tensor, "3"]
-    offset: PerRow
+    outward: Float[Tensor, "3"]  # unit normal (3,), away from the table
+    offset: PerRow  # distance of the plane from the normalised origin along this normal
 
     @classmethod
     def of(cls, plane: Plane, shape: ShapeLike) -> "Face":

@@ -58,18 +58,15 @@ BOUNDS = 3.0  # weight of all bounds but the cones, as great as that of the cone
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A solver stage: at most `steps` steps with given weights of the constraints.
+    """A stage of the contact solver: a number of steps with given weights of the constraints."""
 
-    `centre` and `cones` are weights without unit. `centre` is that of the centroid's offset from
-    the normalised origin, and `cones` that of the friction cones. A contact set stops when its step
-    (normalised) is shorter than `settled`. Unless `exact`, the variance of the surface is
-    extrapolated linearly.
-    """
-
+    # weight (no unit) of the offset of the contacts' centroid from the normalised origin
     centre: float
-    cones: float
-    steps: int
-    settled: float = 1e-3
+    cones: float  # weight (no unit) of the friction cones
+    steps: int  # greatest number of steps
+    settled: float = 1e-3  # length of a step, normalised, below which a contact set stops
+    # whether the variance of the surface is computed at each step; otherwise it is extrapolated
+    # linearly
     exact: bool = True
 
 
@@ -79,32 +76,30 @@ FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False)
 
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
-    """The solver's state for b contact sets of f contacts.
+    """The state of b contact sets of f contacts in the contact solver."""
 
-    `points` (b, f, 3) are the normalised contacts. `tension` (b, p) is that of each of p pairs of
-    contacts: the two pull each other with the force tension times distance. Its scale makes the
-    mean size of the contact forces 1. `jet` holds signed distance and variance of the surface at
-    the points, with derivatives.
-    """
-
-    points: Vectors
+    points: Vectors  # contacts (b, f, 3), normalised
+    # tension (b, p) of each of p pairs of contacts, which pull each other with the force tension
+    # times distance. Its scale makes the mean size of the contact forces 1.
     tension: Tensions
-    jet: SurfaceJet
+    jet: SurfaceJet  # signed distance and variance of the surface at the contacts, with derivatives
 
 
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
-    """The linearised constraints of a contact sets (the letter a is their number).
+    """The linearised constraints of the contact sets that still go on, a in number, at their
+    present state.
 
-    `residual` holds r constraints times their `weight` (no unit; `Constraints` gives the units of
-    the values). `jacobian` holds the derivatives of the constraints, without weights, with respect
-    to the u unknowns.
+    Each set has r constraints on u unknowns: the coordinates of its contacts, then its tensions. A
+    satisfied inequality has the weight 0.
     """
 
+    # values of the constraints, in the units of `Constraints`, times their weight
     residual: Float[Tensor, "a r"]
-    weight: Float[Tensor, "a r"]
-    jacobian: Float[Tensor, "a r u"]
-    inside: Bool[Tensor, "a"]  # whether all points are in the domain
+    weight: Float[Tensor, "a r"]  # weight of each constraint (no unit)
+    jacobian: Float[Tensor, "a r u"]  # derivatives of the unweighted constraints by the unknowns
+    # whether all contacts of a set are in the shape's domain, where the surface is known
+    inside: Bool[Tensor, "a"]
 
     @property
     def weighted_jacobian(self) -> Float[Tensor, "a r u"]:
@@ -114,21 +109,19 @@ class LinearConstraints(Linearisation):
 
 @dataclasses.dataclass(frozen=True)
 class Descent(Minimisation[State, LinearConstraints]):
-    """The least-squares problem of one stage: half the sum of squared weighted constraints is
-    minimised.
-
-    `shape`, `problem` and `stage` are the surface, the constraints and the weights.
+    """The minimisation problem of one solver stage: half the sum of the squared weighted
+    constraints of each contact set.
     """
 
-    shape: ShapeLike
-    problem: ContactProblem
-    stage: Stage
+    shape: ShapeLike  # the estimated surface, or one for each contact set
+    problem: ContactProblem  # the constraints on the contacts
+    stage: Stage  # weights of the constraints, and rules when a set stops
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearConstraints:
-        """Return the constraints and their Jacobian at a state; satisfied inequalities have weight
-        0.
+        """Return the constraints and their Jacobian for some contact sets, a in number.
 
-        `rows` are the indices of the state's contact sets in the batch.
+        Satisfied inequalities have weight 0. `state` holds the contacts and tensions of these sets.
+        `rows` (a,) are their indices in the batch.
         """
         problem = self.problem.rows(rows)
         constraints = problem.constraints(state.points, state.tension, state.jet)
@@ -143,10 +136,12 @@ class Descent(Minimisation[State, LinearConstraints]):
         return LinearConstraints(cost, residual, weight, constraints.jacobian, inside)
 
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
-        """Return each contact set's damped step, and whether it is long enough to go on.
+        """Return the damped step (a, u) of each contact set, and a mask (a,) of the sets that go
+        on.
 
-        `model` is the linear model, and `damping` holds a number for each set. A step has u
-        numbers, and is NaN for a singular matrix.
+        A set goes on if its step is at least `Stage.settled` long. `model` holds the linearised
+        constraints, and `damping` (a,) a number for each set. A step changes the u unknowns, and is
+        NaN for a singular matrix.
         """
         jacobian = model.weighted_jacobian
         scale = jacobian.new_ones(1, jacobian.shape[2])
@@ -161,9 +156,10 @@ class Descent(Minimisation[State, LinearConstraints]):
         return x / shrink[:, None], length / shrink > self.stage.settled  # NaN is not longer
 
     def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
-        """Return the state after a step x of the unknowns; the contacts move along the surface.
+        """Return the state of the contact sets after the step `x` (a, u) of their unknowns.
 
-        `rows` are the indices of the state's contact sets in the batch.
+        The contacts move along the surface. `state` holds contacts and tensions before the step.
+        `rows` (a,) are the indices of these sets in the batch.
         """
         by_points, by_tension = split_unknowns(x)
         shape = rows_of(self.shape, rows)
@@ -181,10 +177,16 @@ class Descent(Minimisation[State, LinearConstraints]):
     def judge(
         self, model: LinearConstraints, trial: LinearConstraints, x: Step, damping: Damping
     ) -> Verdict:
-        """Return a mask of the steps that lower the cost inside the domain, and the next damping
-        (Nielsen's rule).
+        """Return a mask (a,) of the accepted steps, and the damping (a,) of the next ones by
+        Nielsen's rule.
 
-        `model` is the linear model before the step x, and `trial` that after it.
+        A step is accepted if it lowers the cost and all contacts stay in the shape's domain.
+
+        Args:
+            model: linearised constraints of the contact sets before the step.
+            trial: linearised constraints after the step.
+            x: the step (a, u) of the unknowns.
+            damping: damping (a,) with which the step was computed.
         """
         kept = (model.cost - trial.cost) / promised_decrease(model, x)
         accepted = (kept > 0) & trial.inside  # NaN is not accepted
@@ -193,9 +195,10 @@ class Descent(Minimisation[State, LinearConstraints]):
         return accepted, torch.where(accepted, eased, (4 * damping).clamp(max=MOST_DAMPING))
 
     def refuse(self, model: LinearConstraints, trial: LinearConstraints) -> LinearConstraints:
-        """Return the linear model after a rejected step: `model`, with another Jacobian.
+        """Return the linearised constraints with which a contact set goes on after a rejected step.
 
-        Its Jacobian is the mean of those of `model` before and `trial` after the step.
+        They are those of `model`, before the step, with another Jacobian: the mean of those before
+        and after it. `trial` holds the constraints after the step.
         """
         # Near an observation a thin plate's normals change abruptly. The mean Jacobian points down
         # along the kink.
@@ -203,7 +206,9 @@ class Descent(Minimisation[State, LinearConstraints]):
 
 
 def promised_decrease(model: LinearConstraints, x: Step) -> Float[Tensor, "a"]:
-    """Return the decrease of each set's cost that the linear model predicts for the step x."""
+    """Return the decrease (a,) of each contact set's cost that its linear model predicts for the
+    step `x` (a, u).
+    """
     linear = model.residual + matvec(model.weighted_jacobian, x)
     return (model.residual.square().sum(1) - linear.square().sum(1)) / 2
 

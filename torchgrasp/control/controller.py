@@ -70,7 +70,8 @@ class GraspController:
         reference: the closing plan (`ClosingReference.from_grasp`).
         closing: the closing mode, such as "uncertainty" or "paper"; `TrialSpec` explains all.
         holding: the holding mode, such as "grip" or "force"; `TrialSpec` explains all. None means
-            "grip", or "force" where the closing mode or the sensor does not allow "grip".
+            "grip", or "force" where the closing mode or the sensors do not allow "grip". The
+            sensors are those of the plan, `reference.sensor`.
         options: options of the closing. None means `ClosingOptions()`, or all off for a mode
             without options.
         approach: remaining length [m] of the approach; 0 means that the hand is at its pre-grasp.
@@ -86,7 +87,8 @@ class GraspController:
     * options or the holding "law" for a closing mode that does not allow them;
     * the closing "paper" with a plan whose `distance_variance` is None;
     * "impedance" for more than three fingertips;
-    * modes that need more than the sensor measures, or a sensor that names an unknown finger;
+    * modes that need more than the fingertip sensors measure (`reference.sensor`);
+    * a `reference.sensor` that names an unknown finger as one with a dead sensor;
     * an approach whose options allow no stops;
     * an approach whose plan lacks a direction, a table, a surface or tactile fingertips;
     * a `max_force` of the plan that the modes do not keep;

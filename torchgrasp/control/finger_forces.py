@@ -32,19 +32,20 @@ class PreferredForces(Value):
     """Typical normal forces of stable grasps of three fingers, with their covariance, and spring
     stiffnesses.
 
-    `forces` [N] and `covariance` [N^2] are in the order of the hand's fingers. `springs` [N/m] are
-    the stiffnesses of the virtual springs along the sides (0, 1), (1, 2) and (2, 0) of the triangle
-    of fingertips.
+    The fingers are in the order of the hand.
     """
 
-    forces: Float[Tensor, "3"]
-    covariance: Float[Tensor, "3 3"]
+    forces: Float[Tensor, "3"]  # mean normal force [N] of each finger
+    covariance: Float[Tensor, "3 3"]  # covariance of these forces [N^2]
+    # stiffness [N/m] of the virtual springs along the sides (0, 1), (1, 2) and (2, 0) of the
+    # triangle of fingertips
     springs: Float[Tensor, "3"]
 
 
 @runtime_checkable
 class ForcePreference(Protocol):
-    """A model of preferred finger forces, such as a model of stability.
+    """The interface of a model that says how hard each finger should press, such as a model of
+    stability.
 
     Several sets of balanced forces may need almost the least friction. Of these, the one nearest to
     the preferred forces is taken.
@@ -53,11 +54,13 @@ class ForcePreference(Protocol):
     def preferred_forces(
         self, tips: Float[Tensor, "3 3"], force: Positive | None = None
     ) -> PreferredForces:
-        """Return the preferred normal forces of three fingertips with centres `tips` [m], in any
-        frame.
+        """Return the preferred normal forces [N] of three fingers, with their covariance, and
+        spring stiffnesses.
 
-        `force` [N] is the normal force of the finger that presses hardest; with None the model
-        chooses it.
+        Args:
+            tips: centres (3, 3) [m] of the fingertips, in any frame.
+            force: normal force [N] of the finger that presses hardest; None means that the model
+                chooses it.
         """
         ...
 

@@ -23,7 +23,9 @@ class FrictionNumbers:
     """Parameters of `FrictionEstimate`, the running estimate of the friction coefficient."""
 
     mean: float = 0.8
-    """Estimate at the start, if the grasp was planned for a single coefficient."""
+    """Coefficient of friction that is estimated at the start, if the grasp was planned for a single
+    one.
+    """
     std: float = 0.2
     """Standard deviation of this first estimate."""
     least_std: float = 0.03
@@ -216,7 +218,7 @@ class LoadEstimate:
 
     @property
     def weight(self) -> float:
-        """Size [N] of the low-passed force."""
+        """Size [N] of the force in the low-passed load (`wrench`) on the fingertips."""
         return float(np.linalg.norm(self.wrench[:3]))
 
     @property

@@ -50,7 +50,7 @@ class BarrierNumbers:
     forces would grow huge.
     """
     steps: int = 8
-    """Most Newton steps of one call."""
+    """Greatest number of Newton steps of one call."""
     strides: int = 8
     """Number of step lengths that are tried, each twice the one before."""
     solved: float = 0.3

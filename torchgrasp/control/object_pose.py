@@ -213,12 +213,15 @@ class Touches:
 
 
 class Localization:
-    """Search for the object displacement that best explains a list of touches (`Touches`); each
-    call tries one rotation angle.
+    """Search for the displacement of the object that best explains a list of touches; each call
+    tries one rotation angle.
 
     Later touches weigh more, because each touch may move the object. If the hand touched nothing
-    (`Touches.nothing`), the object is probably not where the hand closed. The plan `reference` must
-    have a surface and a table.
+    (`Touches.nothing`), the object is probably not where the hand closed.
+
+    Args:
+        reference: the closing plan, with a surface and a table.
+        touches: touches of one attempt or stop each, in the order of time.
     """
 
     def __init__(self, reference: ClosingReference, touches: Sequence[Touches]) -> None:

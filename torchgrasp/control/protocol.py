@@ -24,8 +24,10 @@ all joints.
 
 @runtime_checkable
 class Closing(Protocol):
-    """A controller that closes the fingers. Each call maps an observation and a period [s] to the
-    next targets (j,) [rad] of all joints of the URDF.
+    """The interface of a controller that closes the fingers of a hand on an object.
+
+    Call it at each control tick with an `Observation` and the time [s] to the next tick. It returns
+    the targets (j,) [rad or m] of all j joints of the URDF.
     """
 
     @property
@@ -35,7 +37,7 @@ class Closing(Protocol):
 
     @property
     def done(self) -> bool:
-        """Whether the closing has ended."""
+        """Whether the closing has ended, so that the hand can press."""
         ...
 
     @property
@@ -47,13 +49,22 @@ class Closing(Protocol):
         ...
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
+        """Return the targets (j,) [rad or m] of all joints of the URDF until the next tick.
+
+        Args:
+            observation: what the hand measures now.
+            period: time [s] to the next tick.
+        """
         ...
 
 
 @runtime_checkable
 class LawClosing(Closing, Protocol):
-    """A closing controller with a control law that can also press."""
+    """The interface of a closing controller whose control law can also press on the object
+    afterwards.
+
+    The law mixes position control and force control of each finger.
+    """
 
     @property
     def share(self) -> Float[Tensor, "f"]:
@@ -61,8 +72,10 @@ class LawClosing(Closing, Protocol):
         ...
 
     def press(self) -> Step:
-        """Return the function by which the same law presses. At each control period it maps an
-        observation and the period [s] to targets (j,) [rad] of all joints.
+        """Return the function by which the same control law presses after the closing.
+
+        Call it at each control tick with an `Observation` and the time [s] to the next tick. It
+        returns the targets (j,) [rad or m] of all joints.
         """
         ...
 
@@ -70,8 +83,11 @@ class LawClosing(Closing, Protocol):
 class Settled:
     """A timer of how long a closing has settled: `time` [s] counts while all fingers touch.
 
-    If `update` is called with `pressing`, they must also be under force control, with steady
+    If `update` is called with `pressing`, the fingers must also be under force control, with steady
     forces.
+
+    Args:
+        reference: the closing plan, which gives the number of fingers.
     """
 
     def __init__(self, reference: ClosingReference) -> None:

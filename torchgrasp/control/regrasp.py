@@ -268,7 +268,14 @@ class Withdrawal:
     """The targets of each tick in which a hand opens, withdraws against its approach, and waits
     until the object rests.
 
-    `speed` [m/s] is the speed of the withdrawing hand at the latest of these targets.
+    Iteration yields them in turn. `speed` [m/s] is the speed of the withdrawing hand at the latest
+    of these targets.
+
+    Args:
+        controller: the controller of the grasp that failed.
+        observation: what the hand measures now.
+        period: time [s] between two ticks.
+        length: distance [m] by which the hand withdraws.
     """
 
     def __init__(

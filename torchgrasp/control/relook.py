@@ -23,7 +23,7 @@ class RelookNumbers:
     scale: float = 0.004
     """Scale s [m] of Cauchy's cost: points farther than this from the surface count less."""
     points: int = 300
-    """Most points of the cloud that are used."""
+    """Greatest number of points of the new cloud that are used."""
     shifts: int = 17
     """Number of shifts of the grid on each axis of the table, from -80 mm to 80 mm (`REACH`)."""
     turns: int = 7

@@ -47,8 +47,8 @@ class DragTrialNumbers:
     rest: float = 0.5
     """Time [s] after the drag in which the object comes to rest."""
     below: float = 0.005
-    """Depth [m] of the object's lowest point below the table, beyond which it hangs or falls over
-    the edge.
+    """Depth [m] below the table of the object's lowest point, beyond which the object hangs or
+    falls over the edge.
     """
     tipped: float = math.radians(10)
     """Tilt [rad] of the object against the vertical beyond which it has toppled."""
@@ -57,7 +57,9 @@ class DragTrialNumbers:
     it.
     """
     table_friction: float = 0.3
-    """Coefficient of friction between object and table by default: that of `plan_edge_grasps`."""
+    """Coefficient of friction between object and table by default, the same as in
+    `plan_edge_grasps`.
+    """
 
 
 DRAGS = DragTrialNumbers()

@@ -22,11 +22,13 @@ class BootstrapNumbers:
     """Parameters of the bootstrap that finds the confidence interval of a success rate."""
 
     resamples: int = 10_000
-    """Resamples of the families; with more, the ends of the interval vary less."""
+    """Number of resamples of the families of objects. With more, the ends of the interval vary
+    less.
+    """
     outside: float = 0.05
-    """Probability that the true value lies outside the interval."""
+    """Probability that the true success rate lies outside the interval."""
     tails: tuple[float, float] = (0.025, 0.975)
-    """Quantiles at the ends of the interval."""
+    """Quantiles of the resampled success rates that are the ends of the interval."""
 
 
 BOOTSTRAP = BootstrapNumbers()

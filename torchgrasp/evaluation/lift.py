@@ -54,8 +54,8 @@ class LiftNumbers:
     judged: float = 0.2
     """Time [s] at the end of the trial in which the fingers must touch the object."""
     lost: float = 0.5
-    """Distance [m] that the object moves, beyond the lift's height, at which the trial ends: it is
-    lost.
+    """Distance [m], beyond the lift's height, that the object may move: beyond it, the object is
+    lost, and the trial ends.
     """
 
 
@@ -159,7 +159,9 @@ class _ObjectLost(Exception):
 
 
 class RecordedLift:
-    """One lift trial, with the record of its control ticks."""
+    """One simulated trial that closes the hand, lifts the object and holds it, with the record of
+    its control ticks.
+    """
 
     def __init__(self, run: TrialRun) -> None:
         self.run = run

@@ -324,13 +324,13 @@ def _mean(values: Iterable[float]) -> float | None:
 
 
 class Bin(NamedTuple):
-    """A calibration bin: the predictions (probabilities) in [low, high), and the outcome of their
+    """A calibration bin: grasps whose predicted success is in [low, high), and the outcome of their
     trials.
     """
 
-    low: float
-    high: float
-    predicted: float  # mean prediction
+    low: float  # least predicted success of the bin
+    high: float  # upper bound of the predicted success of the bin
+    predicted: float  # mean predicted success of the grasps in the bin
     passed: Share  # success rate of the trials
 
 

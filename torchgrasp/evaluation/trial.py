@@ -320,7 +320,7 @@ def derive_reference(
 
 
 class TrialRun:
-    """One run of a trial in a fresh scene.
+    """One run of a simulated trial in a fresh scene, with its controller.
 
     Its phases `approach` and `close` are iterators that yield after every control tick, a period of
     the controller.

@@ -30,11 +30,11 @@ class PostureNumbers:
 
     same_tip: float = 1e-4  # greatest distance [m] of a fingertip from that of the file
     same_joint: float = 1e-3  # greatest difference [rad or m] of a joint that moves no fingertip
-    backward: float = 0.05  # a joint [rad] that bends less is no sign of a reversed axis
+    backward: float = 0.05  # bend of a joint [rad] below which it is no sign of a reversed axis
     short: float = 0.5  # greatest backward part of a joint's range, as a share of the forward part
     reached: float = 1e-6  # sum of squared errors of the fingertips [mm^2] that ends a search
-    rounding: float = 1e-6  # a joint [rad or m] may pass its limits by it
-    steps: int = 60  # most steps in which fingers take up the motion of a wrist
+    rounding: float = 1e-6  # distance [rad or m] by which a joint may exceed its limits
+    steps: int = 60  # greatest number of steps in which fingers take up the motion of a wrist
     stalled: float = 1e-4  # relative decrease of the squared errors below which a search ends
 
 
@@ -42,17 +42,15 @@ POSTURE = PostureNumbers()
 
 
 class Column(NamedTuple):
-    """One joint of another program's file. Its value in our hand is `factor` times the file's
-    value, plus `offset`.
+    """How one joint of another program's file becomes a joint of our hand.
 
-    `joint` is its name in the hand's URDF. `offset` is in rad, or in m for a sliding joint.
-    `turned` says whether the user gave a factor.
+    Its value in our hand is `factor` times the value in the file, plus `offset`.
     """
 
-    joint: str
-    factor: float = 1.0
-    offset: float = 0.0
-    turned: bool = False
+    joint: str  # name of the joint in the hand's URDF
+    factor: float = 1.0  # factor on the value in the file
+    offset: float = 0.0  # number [rad, or m for a sliding joint] that is then added
+    turned: bool = False  # whether the user gave the factor
 
 
 def read_order(hand: Hand, order: Sequence[str]) -> tuple[Column, ...]:

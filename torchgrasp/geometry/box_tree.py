@@ -9,15 +9,17 @@ LEAF = 32  # most points in a leaf: a loop tries them faster than it opens furth
 
 
 class Boxes(NamedTuple):
-    """A tree of boxes: the root is box 1, and box i holds boxes 2 i and 2 i + 1.
+    """A tree of boxes around points, in which nearest points are sought.
 
-    The last l boxes are leaves. There is no box 0.
+    Box 1 is the root, and box i holds boxes 2 i and 2 i + 1. There is no box 0. The last l boxes
+    are leaves, which hold s points each.
     """
 
     low: np.ndarray  # least coordinates (2 l, 3) of the points in a box
-    high: np.ndarray  # greatest coordinates (2 l, 3)
-    points: np.ndarray  # points (l, s, 3) of each leaf; NaN fills the last of them up
-    rows: np.ndarray  # index (l, s) of each of these points in the array that was sorted
+    high: np.ndarray  # greatest coordinates (2 l, 3) of the points in a box
+    points: np.ndarray  # points (l, s, 3) of each leaf; the last leaf is filled up with NaN
+    # index (l, s) of each of these points in the array from which the tree was made
+    rows: np.ndarray
 
 
 def sort_into_boxes(points: np.ndarray) -> Boxes:

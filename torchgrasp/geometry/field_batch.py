@@ -27,7 +27,8 @@ class FieldBatch(DistanceField):
     the field with the index `owner[r]`.
     """
 
-    nodes: Float[Tensor, "n"]  # signed distances [m] of all fields, one after another
+    # signed distances [m] at all nodes of all c fields, one field after another
+    nodes: Float[Tensor, "n"]
     # origin (x, y, z) [m] of each field, and the spacing [m] of its nodes
     places: Float[Tensor, "c 4"]
     # Of each field: 3 indices of the last node on each axis, and 2 strides on x and y. Then the

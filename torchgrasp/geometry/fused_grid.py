@@ -16,7 +16,10 @@ from torchgrasp.geometry.fused_vectors import dot, put, scale
 
 
 class LookedUp(NamedTuple):
-    """A grid of signed distances, negative inside an object, for compiled loops."""
+    """A grid of signed distances, negative inside an object, as NumPy arrays for compiled loops.
+
+    It is what `query` interpolates in. n counts the nodes of the grid.
+    """
 
     values: np.ndarray  # signed distances (n,) [m] at the nodes, those along z adjacent
     origin: np.ndarray  # position (3,) [m] of node (0, 0, 0)
@@ -43,18 +46,19 @@ def query(
 
 @inlined
 def cell_of(part, p, axis):
-    """Return the coordinate of a point `p` [m] on an axis of the grid `part`, in spacings from node
-    0.
+    """Return the coordinate of a point `p` [m] on one axis of a grid, in spacings from node 0.
+
+    `part` is the grid, with the fields of `LookedUp`, and `axis` is 0, 1 or 2.
     """
     return (p[axis] - part.origin[axis]) / part.spacing
 
 
 @inlined
 def inside_grid(part, at, axis):
-    """Return the coordinate within the grid `part` that is nearest to the coordinate `at` on an
-    axis.
+    """Return the coordinate within a grid that is nearest to the coordinate `at` on one axis.
 
-    Both are in spacings from node 0. NaN gives 0, as it would be no index.
+    Both are in spacings from node 0. NaN gives 0, as it would be no index. `part` is the grid, with
+    the fields of `LookedUp`, and `axis` is 0, 1 or 2.
     """
     last = part.shape[axis] - 1.0
     at = at if at > 0.0 else 0.0
@@ -69,9 +73,10 @@ def _lerp(a, b, share):
 
 @inlined
 def look_up(part, p):
-    """Return (distance, gradient) at a point `p` [m], interpolated in the grid `part`.
+    """Return (distance, gradient) at a point `p` [m], interpolated in a grid of signed distances.
 
-    The signed distance is in metres; the gradient is a tuple of three numbers without unit.
+    The signed distance is in metres; the gradient is a tuple of three numbers without unit. `part`
+    is the grid, with the fields of `LookedUp`.
     """
     x = cell_of(part, p, 0)
     y = cell_of(part, p, 1)

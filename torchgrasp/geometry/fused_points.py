@@ -44,10 +44,17 @@ def _squared_gap(point, low, high):
 
 @inlined
 def find_nearest(point, boxes, stack, kept, nearest):
-    """Write the indices of the points in `boxes` that are nearest to a point into `nearest`.
+    """Write the indices of the points in `boxes` that are nearest to a `point` into `nearest`.
 
-    Their squared distances replace those in `kept`, which ascend; only nearer points are taken.
-    Indices count the points of all leaves, leaf by leaf. `stack` is memory for the search.
+    The points of all leaves are counted, leaf by leaf. As many are found as `nearest` has places.
+
+    Args:
+        point: the point, three numbers.
+        boxes: the tree (`Boxes`) of the points.
+        stack: integers, the memory for the search.
+        kept: squared distances, ascending, up to which points are taken; those of the found points
+            replace them.
+        nearest: indices that belong to `kept`.
     """
     low, high, samples = boxes
     leaves, size, _ = samples.shape

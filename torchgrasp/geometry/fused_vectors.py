@@ -5,53 +5,54 @@ from torchgrasp.foundation.fused import inlined
 
 @inlined
 def dot(a, b):
-    """Return the dot product of two vectors."""
+    """Return the dot product of the vectors `a` and `b`."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inlined
 def cross(a, b):
-    """Return the cross product of two vectors."""
+    """Return the cross product of the vectors `a` and `b`, as a tuple."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @inlined
 def add(a, b, factor):
-    """Return a vector plus another one times a factor."""
+    """Return the vector `a` plus `factor` times the vector `b`, as a tuple."""
     return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
 
 
 @inlined
 def minus(a, b):
-    """Return the difference of two vectors."""
+    """Return the vector `a` minus the vector `b`, as a tuple."""
     return add(a, b, -1.0)
 
 
 @inlined
 def scale(v, factor):
-    """Return a vector times a factor, as a tuple."""
+    """Return the vector `v` times the number `factor`, as a tuple."""
     return v[0] * factor, v[1] * factor, v[2] * factor
 
 
 @inlined
 def put(row, v):
-    """Write a vector into a row of an array."""
+    """Write the vector `v` into `row`, a row of an array."""
     for k in range(3):
         row[k] = v[k]
 
 
 @inlined
 def copy(to, values):
-    """Write an array of any shape into another one; an assignment takes seconds to compile."""
+    """Write the array `values` into `to`, of the same shape; an assignment compiles for seconds."""
     for k in range(values.size):
         to.flat[k] = values.flat[k]
 
 
 @inlined
 def insert(values, owners, value, owner):
-    """Insert a value among ascending `values`, and its owner likewise among `owners`.
+    """Insert the number `value` among the ascending `values`, and its `owner` at the same place of
+    `owners`.
 
-    The last of each drops out. The value must be below the last of `values`.
+    The last entry of each array drops out. The number must be below the last of `values`.
     """
     k = len(values) - 1
     while k > 0 and values[k - 1] > value:
@@ -64,8 +65,9 @@ def insert(values, owners, value, owner):
 
 @inlined
 def factorise(matrix):
-    """Replace the lower half of a matrix by its Cholesky factor; return whether it is positive
-    definite.
+    """Replace the lower half of a symmetric `matrix` (d, d) by its Cholesky factor.
+
+    Return whether the matrix is positive definite; if not, its lower half is spoilt.
     """
     for i in range(len(matrix)):
         for j in range(i + 1):
@@ -83,7 +85,10 @@ def factorise(matrix):
 
 @inlined
 def solve_factorised(factor, x):
-    """Solve for a vector x in place, given the lower Cholesky factor of the matrix."""
+    """Replace the right-hand side `x` (d,) of a linear system by its solution.
+
+    `factor` is the lower Cholesky factor (d, d) of the matrix of the system.
+    """
     d = len(x)
     for i in range(d):
         for k in range(i):

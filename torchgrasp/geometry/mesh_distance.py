@@ -28,19 +28,19 @@ class MeshDistanceNumbers:
     sample: float = 0.002
     """Side [m] of the square for which the surface has one sample on average."""
     least_samples: int = 2000
-    """Least samples of a surface."""
+    """Least number of samples of a surface."""
     most_samples: int = 40_000
-    """Most samples of a surface, which bounds the time."""
+    """Greatest number of samples of a surface, which bounds the time."""
     few: int = 8
-    """For points far from the surface, one in this number of samples is used."""
+    """Reciprocal of the share of the samples that is used for points far from the surface."""
     tried: int = 3
-    """Number of triangles that are tried for a point near the surface."""
+    """Number of nearest triangles that are tried for a point near the surface."""
     leaf: int = 32
-    """Samples in a leaf of the search tree."""
+    """Greatest number of samples in a leaf of the search tree."""
     at_once: int = 8192
-    """Points whose distances are sought at once, which bounds memory."""
+    """Number of points whose distances are sought at once, which bounds the memory."""
     digits: int = 9
-    """Decimals [m] in which the corners of neighbouring triangles agree."""
+    """Number of decimals [m] in which the corners of neighbouring triangles agree."""
 
 
 MESH_DISTANCE = MeshDistanceNumbers()
@@ -133,8 +133,11 @@ class MeshSurface:
 
 
 class Samples:
-    """Points (s, 3) [m] of a surface, and the indices (s,) of their triangles, to find the nearest
-    points.
+    """Sample points of a surface, by which the triangles nearest to a point are found.
+
+    Args:
+        points: s points (s, 3) [m] on the surface.
+        owner: index (s,) of the triangle of each point in the faces of the mesh.
     """
 
     def __init__(self, points: np.ndarray, owner: np.ndarray):

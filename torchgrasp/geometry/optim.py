@@ -22,9 +22,11 @@ CHECK_EVERY = 6  # steps between two looks for ended problems on an accelerator:
 
 @dataclasses.dataclass(frozen=True)
 class Linearisation(Batch):
-    """The costs of a problems of a batch at their current states; subclasses add linear models."""
+    """The costs of the problems of a batch at their present states, a in number. Subclasses add
+    linear models: what a step needs, such as residuals and their Jacobian.
+    """
 
-    cost: Float[Tensor, "a"]  # cost that is minimised (no unit)
+    cost: Float[Tensor, "a"]  # cost of each problem, which is minimised (no unit)
 
 
 Damping = Float[Tensor, "a"]  # damping of each problem's next step; infinite once it has ended
@@ -38,40 +40,64 @@ Model = TypeVar("Model", bound=Linearisation)
 
 
 class Minimisation(abc.ABC, Generic[State, Model]):
-    """Base class of a batch of minimisation problems: costs, steps, and what is accepted."""
+    """Base class of b minimisation problems, which `levenberg_marquardt` solves together.
 
-    first_damping: float = 1e-2  # damping of the first step (no unit)
+    A subclass says how problems are linearised, how a step is computed, and when it is accepted. A
+    state holds the variables of the problems. A model is the linear approximation of the problems
+    at a state: a `Linearisation` with their costs. In the methods, a counts the problems that still
+    go on, and d the variables of each. `rows` (a,) are their indices among all b problems. The
+    damping (a,) is the number that shortens the step of each problem.
+    """
+
+    first_damping: float = 1e-2  # damping of every problem's first step (no unit)
 
     @abc.abstractmethod
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> Model:
-        """Return the costs and linear models, at the states `state`, of the problems with the
-        indices `rows`.
+        """Return the model of some problems at their states: their costs, and what a step needs.
+
+        Args:
+            state: states of these problems.
+            rows: their indices (a,) among all problems.
         """
 
     @abc.abstractmethod
     def step(self, model: Model, damping: Damping) -> Steps:
-        """Return the steps (a, d) of a problems, and a mask (a,) of those that go on.
+        """Return the step (a, d) of each problem, and a mask (a,) of the problems that go on.
 
-        Steps solve the damped normal equations. `model` holds the linear models of the problems,
-        and `damping` the damping of their steps.
+        A step is the change of the d variables that solves the damped normal equations.
+
+        Args:
+            model: linear model of the problems at their present states.
+            damping: damping (a,) of their steps.
         """
 
     @abc.abstractmethod
     def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
-        """Return the states of the problems with the indices `rows` after the steps `x`."""
+        """Return the states of the problems after the steps `x` (a, d) of their variables.
+
+        `state` holds their states before the steps, and `rows` (a,) are their indices among all
+        problems.
+        """
 
     @abc.abstractmethod
     def judge(self, model: Model, trial: Model, x: Step, damping: Damping) -> Verdict:
-        """Return a mask (a,) of the accepted steps, and the damping (a,) of the next steps.
+        """Return a mask (a,) of the accepted steps, and the damping (a,) of each problem's next
+        step.
 
-        `model` is the linear model before the steps `x`, `trial` the one after them, and `damping`
-        that of these steps. An infinite damping ends a problem.
+        An infinite damping ends a problem.
+
+        Args:
+            model: linear model before the steps.
+            trial: linear model after the steps.
+            x: the steps (a, d) of the variables.
+            damping: damping (a,) with which these steps were computed.
         """
 
     def refuse(self, model: Model, trial: Model) -> Model:
-        """Return the model to use after a rejected step: by default the model before the step.
+        """Return the linear model with which a problem goes on after a rejected step.
 
-        `trial` is the model after the step.
+        By default it is `model`, that before the step. `trial` is the linear model after the
+        rejected step.
         """
         return model
 
@@ -133,44 +159,56 @@ Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
 
 @dataclasses.dataclass(frozen=True)
 class LinearResiduals(Linearisation):
-    """The m residuals of each problem of a batch at its state, with their Jacobian by its d
-    variables.
+    """The linear models of least-squares problems, a in number: m residuals of each, and their
+    Jacobian by its d variables.
     """
 
-    residual: Float[Tensor, "a m"]  # the cost is the sum of their squares
-    jacobian: Float[Tensor, "a m d"]
+    # the m residuals of each problem; its cost is the sum of their squares
+    residual: Float[Tensor, "a m"]
+    jacobian: Float[Tensor, "a m d"]  # derivatives of the residuals by the d variables
 
 
 @dataclasses.dataclass(frozen=True)
 class LeastSquares(Minimisation[State, LinearResiduals]):
-    """A batch of least-squares problems: the cost is the sum of squared residuals."""
+    """A batch of least-squares problems: the cost of each is the sum of its squared residuals.
 
-    # function of states, and the indices of their problems: their residuals and Jacobians
+    In shapes, a counts the problems that still go on, m the residuals and d the variables of each.
+    `levenberg_marquardt` solves the problems.
+    """
+
+    # function of states and of the indices (a,) of their problems, which returns residuals (a, m)
+    # and their Jacobian (a, m, d)
     residuals: Callable[[State, Int[Tensor, "a"]], Residuals]
-    # function of states and their steps (a, d): the states after the steps
+    # function of states and of the steps (a, d) of their variables, which returns the states after
+    # the steps
     moved: Callable[[State, Float[Tensor, "a d"]], State]
     solved: float = SOLVED  # sum of squared residuals below which a problem is solved
     largest: float = 0.3  # largest change of a variable in one step, in its own unit
-    # damping that is added for every variable, as one may change no residual
+    # number added to the diagonal of the normal equations, as a variable may change no residual
     floor: float = 1e-3
     fall: float = 3.0  # divisor of the damping after an accepted step
-    rise: float = 4.0  # factor on the damping after a refused step
+    rise: float = 4.0  # factor on the damping after a rejected step
     least: float = 1e-6  # least damping
     most: float = 1e6  # greatest damping
-    lost: float = 30.0  # damping beyond which a refused step ends a problem
+    lost: float = 30.0  # damping beyond which a rejected step ends a problem
     stalled: float = 0.02  # relative decrease of the cost below which a problem has converged
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearResiduals:
-        """Return residuals, Jacobian and sum of squared residuals of the problems with the indices
-        `rows`.
+        """Return the residuals, their Jacobian and the sum of their squares for the problems with
+        the indices `rows` (a,).
+
+        `state` holds the states of these problems.
         """
         residual, jacobian = self.residuals(state, rows)
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
     def step(self, model: LinearResiduals, damping: Damping) -> Steps:
-        """Return the damped steps (a, d), and a mask (a,) of the problems that go on.
+        """Return the damped steps (a, d) of the variables, and a mask (a,) of the problems that go
+        on.
 
-        The step of a problem with a singular matrix is zero.
+        `model` holds the residuals and their Jacobian, and `damping` (a,) the damping of each
+        problem's step. The step of a problem with a singular matrix is zero. A problem ends if its
+        cost is below `solved`, or its damping is infinite.
         """
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
@@ -184,17 +222,26 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         return x * (self.largest / x.abs().amax(1, keepdim=True).clamp_min(self.largest)), taken
 
     def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
-        """Return the states of the problems after the steps `x`; `rows` has no effect."""
+        """Return the states of the problems after the steps `x` (a, d) of their variables.
+
+        `state` holds the states before the steps. `rows` has no effect.
+        """
         return self.moved(state, x)
 
     def judge(
         self, model: LinearResiduals, trial: LinearResiduals, x: Step, damping: Damping
     ) -> Verdict:
-        """Return a mask (a,) of the steps that lower the cost, and the damping (a,) of the next
-        steps.
+        """Return a mask (a,) of the accepted steps, those that lower the cost, and the damping (a,)
+        of the next steps.
 
-        `model` holds the residuals before the step, `trial` those after it. The damping is infinite
-        for a problem that has converged or is stuck, which ends it.
+        An accepted step divides the damping by `fall`, a rejected one multiplies it by `rise`. The
+        damping is infinite for a problem that has converged or is stuck, which ends it.
+
+        Args:
+            model: residuals and costs of the problems before the steps.
+            trial: residuals and costs after the steps.
+            x: the steps (a, d) of the variables; without effect.
+            damping: damping (a,) with which these steps were computed.
         """
         better = trial.cost < model.cost
         converged = trial.cost > (1 - self.stalled) * model.cost

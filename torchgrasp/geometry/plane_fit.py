@@ -20,67 +20,83 @@ class PlaneNumbers:
     """Parameters of the random search for planes in a cloud."""
 
     noise: float = 0.001
-    """Assumed noise [m] of a depth camera that is near."""
+    """Assumed standard deviation [m] of the noise of a depth camera that is near."""
     noise_growth: float = 0.0035
-    """Growth of the noise with the squared distance [1/m]."""
+    """Assumed growth of this noise with the squared distance [1/m]."""
     distance: float = 0.7
     """Assumed distance [m] of a camera whose position is unknown."""
     planes: int = 8
-    """Most planes of a view."""
+    """Greatest number of planes that are found in a view."""
     scored: int = 2000
-    """Most points by which a proposed plane is scored."""
+    """Greatest number of points by which a proposed plane is scored."""
     triples: int = 4000
     """Number of triples of random points, which may be far apart, that propose a plane."""
     neighbours: int = 60
     """Number of nearest points from which a triple of neighbours is drawn."""
     least_height: float = 10.0
-    """Least height of a triangle, over the noise: the normal of a lower one is mostly noise."""
+    """Least height of a triangle, in multiples of the noise: the normal of a lower one is mostly
+    noise.
+    """
     least_side: float = 1e-12
-    """Least side [m] that a triangle's area is divided by."""
+    """Least side [m] by which a triangle's area is divided."""
     at_once: int = 500
-    """Proposals that are scored at once, which bounds memory."""
+    """Number of proposed planes that are scored at once, which bounds the memory."""
     least_share: float = 0.05
-    """Least share of the points on a plane."""
+    """Least share of the points of a view that lie on a plane."""
     most_tilt: float = 30.0
-    """Greatest angle [deg] between the normal and the upward direction, if that is known."""
+    """Greatest angle [deg] between the normal of a plane and the upward direction, if that is
+    known.
+    """
     tilt_slack: float = 5.0
     """Angle [deg] by which a proposed plane may tilt more, because the fit may tilt it back."""
     reach: float = 0.30
-    """Greatest height [m] above a plane of the points of objects on it."""
+    """Greatest height [m] above a plane of points that count as of objects on it."""
     rough: float = 2.5
-    """Scale (ratio of measured to assumed noise) from which a surface counts as not flat."""
+    """Ratio of measured to assumed noise (the scale of a plane) from which on a surface is not
+    flat.
+    """
     smooth: float = 0.2
-    """Least scale: the points may be more exact than the assumed noise."""
+    """Least value of this scale: the points may be more exact than the assumed noise."""
     core: float = 3.0
-    """Greatest distance of a point on a plane, over the product of noise and scale."""
+    """Greatest distance of a point that counts as on a plane, in multiples of assumed noise times
+    scale.
+    """
     quantile: float = 0.25
-    """Quantile of the distances that measures the scale: few points of objects count in it."""
+    """Quantile of the distances from a plane by which the scale is measured: few points of objects
+    count in it.
+    """
     per_quantile: float = 3.14
     """Ratio of the standard deviation to this quantile, for normally distributed residuals."""
     tukey: float = 4.685
-    """Residual, over the scale, from which a point has no weight. With it, Tukey's fit of normally
-    distributed residuals has 95 % of the efficiency of least squares.
+    """Residual, in multiples of the noise times the scale, from which on a point has no weight.
+    With it, Tukey's fit of normally distributed residuals has 95 % of the efficiency of least
+    squares.
     """
     steps: int = 30
-    """Most steps of a fit."""
+    """Greatest number of steps of a plane's fit."""
     patch: float = 0.05
-    """Width [m] of the patches that tell the direction of parallel levels: few hold a step."""
+    """Width [m] of the patches of points that show the normal which parallel levels share. Few
+    patches hold a step between levels.
+    """
     flattest: float = 1.5
-    """Greatest scatter of a patch without a step, over the median one."""
+    """Greatest scatter of a patch without a step, over the median scatter of the patches."""
     rounds: int = 3
-    """Rounds in which patches with a step are left out."""
+    """Number of rounds in which patches with a step are left out."""
     offsets: int = 100
-    """Number of heights at which a level is sought."""
+    """Number of heights at which each of two parallel levels is sought."""
     aslant: float = 10.0
-    """Greatest angle [deg] between two levels and one plane through both."""
+    """Greatest angle [deg] between two parallel levels and one plane through both."""
     mixed: float = 0.7
-    """Least scale of a plane that may go aslant through two levels."""
+    """Least scale of a plane that may be a fit aslant through two levels."""
     again: float = 0.001
-    """Difference of two planes (normal, and offset [m]) below which a fit has found one again."""
+    """Difference of two planes (of the normals, plus that of the offsets [m]) below which they are
+    the same.
+    """
     both: float = 0.7
-    """Least points on two levels, over those on one plane through both."""
+    """Least number of points on two levels, as a share of those on one plane through both."""
     still: float = 1e-12
-    """Change of a plane (normal, and offset [m]) below which its fit ends."""
+    """Change of a plane in a step (of its normal, and of its offset [m]) below which its fit ends.
+    """
 
 
 PLANES = PlaneNumbers()
@@ -102,15 +118,15 @@ def assume_noise(
 
 
 class SeenPoints:
-    """The points of one view, in a frame with their mean as origin.
+    """The n points of one view in which planes are sought, in a frame with their mean as origin.
 
     Args:
-        points: (n, 3) [m].
-        eye: position (3,) [m] of the camera; None if unknown.
-        sky: upward unit vector (3,); None if unknown.
-        image_up: upward unit vector (3,) of the camera's image; None if unknown.
+        points: the points (n, 3) [m].
+        eye: position (3,) [m] of the camera; None if it is unknown.
+        sky: unit vector (3,) against gravity; None if it is unknown.
+        image_up: unit vector (3,) that points up in the camera's image; None if it is unknown.
 
-    `noise` (n,) [m] is the assumed noise of the points.
+    The attribute `noise` (n,) [m] is the assumed standard deviation of each point's noise.
     """
 
     def __init__(
@@ -133,16 +149,15 @@ class SeenPoints:
 
 @dataclasses.dataclass(frozen=True)
 class PlaneFit:
-    """A plane normal . p = offset that holds many points p [m] of a view.
+    """A plane normal . p = offset, fitted to many points p [m] of a view.
 
-    `normal` is a unit vector, `offset` is in metres. `count` points lie on the plane, and `scale`
-    is the ratio of their measured to their assumed noise.
+    Noise is the distance of points from the plane, at one standard deviation.
     """
 
-    normal: Float[Tensor, "3"]
-    offset: float
-    scale: float
-    count: int
+    normal: Float[Tensor, "3"]  # unit normal (3,)
+    offset: float  # distance [m] of the plane from the origin along the normal
+    scale: float  # ratio of the measured to the assumed noise of the points on the plane
+    count: int  # number of points on the plane
 
     def turned_up(self, view: "SeenPoints") -> "PlaneFit":
         """Return the plane with its normal turned to the upper side.

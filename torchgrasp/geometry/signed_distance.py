@@ -27,13 +27,15 @@ class FieldNumbers:
     """Parameters of the computation of a signed distance field from a mesh."""
 
     band: float = 0.026
-    """Distance [m] within which every second node is exact: the reach of a palm's spheres."""
+    """Distance [m] from the surface within which every second node is exact: the reach of a palm's
+    spheres.
+    """
     near: float = 3.0
-    """Distance outside the surface, in spacings, within which every node is exact."""
+    """Distance outside the surface, in spacings of the grid, within which every node is exact."""
     inward: float = 5.0
-    """Distance inside the surface, in spacings, within which every node is exact."""
+    """Distance inside the surface, in spacings of the grid, within which every node is exact."""
     most_nodes: float = 2e7
-    """Most nodes of a grid: 160 MB."""
+    """Greatest number of nodes of a grid, which needs 160 MB."""
 
 
 FIELDS = FieldNumbers()
@@ -56,17 +58,19 @@ class Grid(NamedTuple):
 
 
 class DistanceField(Value, abc.ABC):
-    """Signed distances [m] at the `nodes` of a grid, negative inside.
+    """Base class of signed distances [m] at the nodes of a grid, negative inside an object.
 
-    It holds the grid of one object for all points, or r grids, one for each entry of a batch.
+    A field holds the grid of one object for all points. Or it holds r grids, and in a batch of r
+    entries each entry has its own.
     """
 
-    nodes: Any  # Float[Tensor, "n"] [m], the values of all nodes, those of the z axis contiguous
+    # Float[Tensor, "n"]: distances [m] at all nodes of all grids, those along z adjacent
+    nodes: Any
     spacing: Any  # distance [m] of neighbouring nodes: a number, or (r,) for each entry
 
     @abc.abstractmethod
     def rows(self, index: Int[Tensor, "k"]) -> "DistanceField":
-        """Return the field of the k entries with the indices `index` (k,), in this order.
+        """Return the field for k entries of a batch, with the indices `index` (k,), in this order.
 
         The field of one object is the same for every entry, and is returned unchanged.
         """

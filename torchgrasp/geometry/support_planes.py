@@ -23,21 +23,27 @@ class SupportNumbers:
     """Bounds that decide whether a plane supports objects, and how far it extends."""
 
     points: int = 20_000
-    """Most points that are used, which bounds the time."""
+    """Greatest number of points of a view that are used, which bounds the time."""
     least_points: int = 50
-    """Least points of a view."""
+    """Least number of points of a view in which supports are sought."""
     at_once: int = 10_000
-    """Points that are compared with a region at once, which bounds memory."""
+    """Number of points that are compared with a region at once, which bounds the memory."""
     thickness: float = 4.0
-    """Greatest distance of a point on a support, over its noise."""
+    """Greatest distance of a point that counts as on a support, in multiples of its noise."""
     least_thickness: float = 0.001
     """Distance [m] that is added to the noise: a table is not quite flat."""
     most_through: float = 0.1
-    """Most points that the camera sees through a support's region, over the points on it."""
+    """Greatest number of points that the camera sees below a support, through its region. It is a
+    share of the points on it.
+    """
     slats: float = 0.5
-    """Least points on a support, over those seen through it, in a cell that is no hole."""
+    """Least number of points on a support in a cell that is no hole. It is a share of the points
+    seen through the cell.
+    """
     edge: float = 0.05
-    """Border of the region, over its width, through which the camera may see points."""
+    """Border of the region, as a share of the region's width, through which the camera may see
+    points below.
+    """
     bowed: float = 0.5
     """Factor on the score of a support that is flat in a small part only."""
     flat: float = 1.1
@@ -55,11 +61,15 @@ class SupportNumbers:
     margin: float = 0.1
     """Distance [m] beside a bowed support at which its surface may not go on at another height."""
     most_away: float = 0.5
-    """Most points there near the plane but not on it, over those on the support."""
+    """Greatest number of points there near the plane but not on it, as a share of those on the
+    support.
+    """
     near: float = 0.08
-    """Distance [m] from a target within which its own support is sought if no other carries it."""
+    """Distance [m] from a target within which a support of its own is sought, if no other carries
+    it.
+    """
     shallow: float = 0.01
-    """Greatest depth [m] of the target's foot below that support: its own top is no support."""
+    """Greatest depth [m] of the target's foot below its own support: its own top is no support."""
     outliers: float = 0.02
     """Share of a target's points that may be lower than its foot."""
     foot: float = 0.03
@@ -67,23 +77,35 @@ class SupportNumbers:
     overhang: float = 0.05
     """Greatest distance [m] of a target's points beside the region of its support."""
     over: float = 0.5
-    """Least share of a target's points over the region of its support."""
+    """Least share of a target's points that are above the region of its support."""
     plain: float = 0.75
-    """Share of a low point's score that is lost if it lies on another plane, perhaps a wall."""
+    """Share of the score of a point low above a support that is lost on another plane, perhaps a
+    wall.
+    """
     bow: float = 0.010
-    """Greatest height [m] of a bowed support above or below the plane under the things on it."""
+    """Greatest height [m] of a bowed support above or below the plane that was fitted to a part of
+    it.
+    """
     low: float = 0.06
-    """Height [m] below which points of an object stand close to its support."""
+    """Height [m] above a support below which points are low, so that their object stands on it."""
     pierced_cell: float = 0.02
-    """Width [m] of the columns in which points above and below a support are counted."""
+    """Width [m] of the columns, perpendicular to a support, in which points above and below it are
+    counted.
+    """
     crossed: float = 0.5
-    """Least ratio of points below to points on a plane, in a column where a surface crosses it."""
+    """Least ratio of points below to points on a plane, in a column in which a surface crosses the
+    plane.
+    """
     askew: float = 0.7
     """Greatest cosine between the normals of a support and a wall beside it."""
     sag: float = 2.0
-    """Depth of a point below a support, over the tolerance of points on it: dark feet sag less."""
+    """Least depth of a point that counts as below a support, in multiples of the tolerance of
+    points on it. Dark feet sag less.
+    """
     below: float = 0.2
-    """Least ratio of points below to points above a support, in a column that goes through it."""
+    """Least ratio of points below to points above a support, in a column in which an object goes
+    through it.
+    """
     most_pierced: float = 0.15
     """Greatest share of the low points over a support that continue below it. Between slats, some
     points of an object do.
@@ -93,15 +115,20 @@ class SupportNumbers:
     least_low: float = 0.05
     """Least share of the low points that lie over the region."""
     steep: float = 0.9
-    """Cosine of the camera's angle to the normal above which objects hide their lowest points."""
+    """Sine of the camera's elevation above a support, over which objects hide their lowest points.
+    """
     grazing: float = 5.0
-    """Least angle [deg] between the plane and the camera's direction."""
+    """Least angle [deg] between a support and the direction to the camera, at which the camera sees
+    it from above.
+    """
     favour: float = 2.0
     """Factor on the score of the support that the camera looks at."""
     least_width: float = 0.14
     """Least width [m] of a support's region."""
     furniture: float = 0.3
-    """Width [m] of a region from which it belongs to no object that a hand grasps."""
+    """Width [m] of the region of a plane from which on it is furniture, no object that a hand
+    grasps.
+    """
     small_table: float = 0.2
     """Least width [m] of a bowed support that is parallel to a plane as wide as furniture. Above a
     floor it is a small table.
@@ -109,23 +136,23 @@ class SupportNumbers:
     parallel: float = 0.985
     """Least cosine between the normals of parallel planes: ten degrees."""
     same: float = 0.02
-    """Distance [m] below which parallel planes are the same one."""
+    """Distance [m] between parallel planes below which they are the same one."""
     cell: float = 0.03
     """Width [m] of the cells in which points on a plane are connected."""
     closing: int = 2
-    """Cells by which the groups of points grow and shrink again, to close gaps."""
+    """Number of cells by which the groups of points grow and shrink again, to close gaps."""
     gap: float = 0.25
-    """Points below the plane that the camera sees in a cell of a gap. They are divided by the usual
-    points of a cell on it.
+    """Greatest number of points below the plane that the camera sees in a cell of a gap. It is a
+    share of the mean number of points in a cell of the plane. With fewer, an object hides the gap.
     """
     least_part: float = 0.02
-    """Least size of a group of points, over the largest group."""
+    """Least size of a group of points that counts, as a share of the largest group."""
     most_open: float = 0.05
-    """Most points below the plane that the camera sees between two groups, over the points of the
-    smaller group.
+    """Greatest number of points below the plane that the camera sees between two groups which one
+    object divides. It is a share of the smaller group.
     """
     least_height: float = 1e-9
-    """Least height [m] that a ray to a plane is divided by."""
+    """Least height [m] by which a ray to a plane is divided."""
 
 
 SUPPORTS = SupportNumbers()
@@ -133,14 +160,16 @@ SUPPORTS = SupportNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class SupportPlane:
-    """A plane that objects stand on, and its region: the convex hull of the points on it."""
+    """A plane that objects stand on (a support), and its region: the convex hull of the points on
+    it.
+    """
 
-    plane: Plane  # the camera is above it
-    # Of each side of the region: outward unit vector u (x, y, z) in the plane, and offset o [m].
-    # For points p within, u . p + o < 0. None: the region is unbounded.
+    plane: Plane  # the plane; the camera is above it
+    # Of each of s sides of the region: outward unit vector u (x, y, z) in the plane, and offset o
+    # [m]. Points p within have u . p + o < 0. None means that the region is unbounded.
     sides: Float[Tensor, "s 4"] | None = None
     width: float = math.inf  # least width of the region [m]
-    # whether it is bowed or small, so that the plane holds near its region only
+    # whether the support is bowed or small, so that the plane holds near its region only
     local: bool = False
 
     def covers(self, points: Float[Tensor, "*b 3"], margin: float = 0.0) -> Bool[Tensor, "*b"]:
@@ -223,10 +252,11 @@ def _crossed(
 
 @dataclasses.dataclass(frozen=True)
 class Hull:
-    """A convex polygon in a plane."""
+    """A convex polygon in a plane, with two coordinates in the plane: the convex hull of points."""
 
-    corners: Float[Tensor, "k 2"]  # corners of the polygon, in the plane [m]
-    # outward unit normal n (x, y) of each side, and offset o [m], with n . p + o < 0 within
+    corners: Float[Tensor, "k 2"]  # the k corners (x, y) of the polygon [m]
+    # outward unit normal n (x, y) of each of s sides, and offset o [m]; points p within have n . p
+    # + o < 0
     sides: Float[Tensor, "s 3"]
 
     @classmethod

@@ -31,12 +31,10 @@ SUPPORT = "a plane with objects on it and nothing seen through it, or a table th
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """Points (n, 3) [m] of an object that is to be grasped.
+    """An object that is to be grasped, whose support is sought: some of its points."""
 
-    Its foot is at most `reach` [m] above the plane of its support.
-    """
-
-    points: Points
+    points: Points  # points (n, 3) [m] of the object
+    # greatest height [m] of its lowest points (its foot) above the plane of its support
     reach: float
 
     def stands_on(self, support: SupportPlane) -> bool:

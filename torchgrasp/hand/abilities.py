@@ -28,8 +28,9 @@ class AbilityNumbers:
     sure: float = (
         0.1  # share of the free postures in which a fingertip is weaker than its sure force
     )
-    least_apart: float = 1e-9  # least divisor [m] of a direction between tips that coincide
-    digits: int = 6  # significant digits in files: random postures give no more
+    # least distance [m] of two tips that is a divisor, so that coinciding tips have a direction
+    least_apart: float = 1e-9
+    digits: int = 6  # number of significant digits in files: random postures give no more
 
 
 ABILITY = AbilityNumbers()

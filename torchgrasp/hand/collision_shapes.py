@@ -41,16 +41,16 @@ class CoverNumbers:
     """Parameters of the spheres that cover a hand for collision checks."""
 
     finger_cell: float = 0.015
-    """Edge [m] of a finger's cells; larger: the corners of a shape protrude farther from its
-    spheres.
+    """Edge [m] of the cells into which shapes of a finger are cut, each covered by a sphere. If
+    larger, the corners of a shape protrude farther from its spheres.
     """
     palm_cell: float = 0.022
-    """Edge [m] of the palm's cells."""
+    """Edge [m] of the cells into which shapes of the palm are cut."""
     bulge: float = 0.004
     """Distance [m] by which a sphere may protrude from a shape's faces, other than a
     fingertip's."""
     single_layer: float = 0.025
-    """A shape thinner than this [m] has one layer of cells across."""
+    """Thickness [m] of a shape below which it has one layer of cells across."""
     sunk: float = 0.001
     """Distance [m] by which a cell's corners may protrude from its sphere."""
 

@@ -50,14 +50,12 @@ class Pad(NamedTuple):
 
 
 class Finger(NamedTuple):
-    """A finger: `joints` from the palm outward, the link of its tip (`tip_link`), and the `pad`
-    that may touch objects.
-    """
+    """A finger of a hand, as hand.toml describes it."""
 
-    name: str
-    joints: tuple[str, ...]
-    tip_link: str
-    pad: Pad
+    name: str  # name of the finger
+    joints: tuple[str, ...]  # names of its joints, from the palm outward
+    tip_link: str  # name of the link of its tip
+    pad: Pad  # the part of the tip that may touch objects
 
 
 Grasping = tuple[Finger, ...]  # the grasping fingers, three to five, in grasp order
@@ -68,11 +66,10 @@ Fingers = str | int | tuple[str, ...]
 
 
 class Option(NamedTuple):
-    """An option of hand.toml: the grasping fingers, and the positions [rad or m] by name of parked
-    joints, which stay fixed.
-    """
+    """A choice of grasping fingers that hand.toml offers under a name (an option)."""
 
-    fingers: Grasping
+    fingers: Grasping  # the grasping fingers
+    # positions [rad or m], by name, of the joints that stay fixed meanwhile
     parked: dict[str, float]
 
 

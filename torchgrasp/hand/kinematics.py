@@ -155,20 +155,19 @@ class FreeMotion(Value):
     """Tables of how the links of a free-floating hand, and marker points on them, move in a small
     step.
 
-    The q motions are three translations along the root's axes, and three rotations about them. Then
-    come the joints that the actuated joints move. `moves[l, q]` is 1 if motion q moves link l.
-    `coupling` maps a step of d = 6 + h numbers, of pose and actuated joints, to the motions. None
-    means the identity.
-
-    `product` maps the frames of all links to all m markers in one matrix product. Each coordinate
-    of the frames has k = 4 l numbers. The markers come in groups of `sizes`. First come the given
-    groups, then the origins of all motions, all rotation axes, and all translation axes. One of the
-    two axes of a motion is zero.
+    The hand has q motions. They are three translations along the root's axes, three rotations about
+    them, and those of the moved joints. A step has d = 6 + h numbers: for the pose, and for the h
+    actuated joints. A marker is a point or a direction on a link. Markers come in groups. First
+    come the given groups, then the origins of all motions, all rotation axes, and all translation
+    axes. One of the two axes of a motion is zero.
     """
 
+    # matrix that maps the k = 4 l numbers of one coordinate of the frames of the l links to that of
+    # all m markers
     product: Float[Tensor, "m k"]
-    sizes: tuple[int, ...]
-    moves: Float[Tensor, "l q"]
+    sizes: tuple[int, ...]  # number of markers in each group
+    moves: Float[Tensor, "l q"]  # 1 if motion q moves link l, else 0
+    # matrix from a step to the motions; None means the identity
     coupling: Float[Tensor, "q d"] | None
 
     @classmethod

@@ -28,20 +28,24 @@ Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]
 LEAST_SQUARE = 1e-24  # least squared length [m2]: the derivative of its root is finite
 PARALLEL_EDGES = 1e-10  # squared sine below which edges are parallel
 Pushed = tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]
-"""The directions in which second shapes leave the first, and contact points."""
+"""Of c pairs of shapes: unit directions that push the second shape out of the first one, and contact
+points [m].
+"""
 Push = Callable[[Int[Tensor, " c"]], Pushed]
-"""Function of pair indices that returns how these pairs are pushed apart."""
+"""Function of the indices (c,) of some pairs of shapes, which returns how they are pushed apart."""
 
 
 class Chosen(NamedTuple):
-    """Chosen pairs of shapes in some postures, sorted by pair: entry i is `pair[i]` in posture
-    `row[i]`.
+    """k chosen combinations of a pair of shapes with a posture of the hand, sorted by pair.
 
-    `parts` holds each kind of pair (its number of spheres, 0 to 2), with the slice of its entries.
+    `pair[i]` is the index of a pair in `SelfCollision.pairs`, and `row[i]` that of a posture. Pairs
+    of one kind are neighbours, so `parts` gives each kind a slice.
     """
 
-    pair: Int[Tensor, " k"]
-    row: Int[Tensor, " k"]
+    pair: Int[Tensor, " k"]  # indices in `SelfCollision.pairs`
+    row: Int[Tensor, " k"]  # indices of postures
+    # (kind, slice of the k combinations) of each kind that occurs. The kind is the number of
+    # spheres in a pair: 0 is box-box, 1 sphere-box, 2 sphere-sphere.
     parts: list[tuple[int, slice]]
 
 
@@ -340,17 +344,17 @@ def _unit(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "3 *b"]:
 
 
 class BoxPairs(NamedTuple):
-    """Values of k pairs of boxes, in one frame.
+    """k pairs of boxes whose separations are computed; box a is the first of a pair, box b the
+    second.
 
-    The unit axes of the two boxes are the columns of `a[:, :, k]` and `b[:, :, k]`. `gap` [m] is
-    the vector from the first centre to the second; `half_a` and `half_b` [m] are the half sizes.
+    All vectors of a pair are in one frame.
     """
 
-    a: Float[Tensor, "3 3 k"]
-    b: Float[Tensor, "3 3 k"]
-    gap: Float[Tensor, "3 k"]
-    half_a: Float[Tensor, "3 k"]
-    half_b: Float[Tensor, "3 k"]
+    a: Float[Tensor, "3 3 k"]  # unit axes of box a, the columns of `a[:, :, k]`
+    b: Float[Tensor, "3 3 k"]  # unit axes of box b, the columns of `b[:, :, k]`
+    gap: Float[Tensor, "3 k"]  # vector [m] from the centre of box a to that of box b
+    half_a: Float[Tensor, "3 k"]  # half sizes [m] of box a along its axes
+    half_b: Float[Tensor, "3 k"]  # half sizes [m] of box b along its axes
 
     def along_axes(self) -> Float[Tensor, "15 k"]:
         """Return the separations [m] along the 15 candidate axes of two boxes (Gottschalk et al.,

@@ -33,15 +33,16 @@ Triple = tuple[float, float, float]
 
 
 class Mimic(NamedTuple):
-    """A coupled joint: its position is `ratio` times that of the joint `source`, plus `offset`
-    [rad or m].
+    """How the position of a coupled joint follows that of other joints.
 
-    A joint that follows a sum, as by a tendon, has `others`: further sources with their ratios.
+    The position is `ratio` times that of the joint `source`, plus `offset`. A joint that follows a
+    sum, as by a tendon, adds the terms of `others`.
     """
 
-    source: str
-    ratio: float
-    offset: float
+    source: str  # name of the joint that is followed
+    ratio: float  # factor on its position (no unit between joints of one kind)
+    offset: float  # position [rad or m] if all followed joints are at 0
+    # names of further followed joints, each with its ratio
     others: tuple[tuple[str, float], ...] = ()
 
     @property
@@ -62,18 +63,15 @@ class Mimic(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class LinkShape:
-    """A collision shape of a link; its `kind` is "box", "sphere", "cylinder" or "mesh".
+    """A collision shape of a link of a URDF."""
 
-    `size` is (x, y, z) of a box, (radius,) of a sphere, (radius, length) of a cylinder [m]; the
-    scale of a mesh. The shape is at `xyz` [m] in the link's frame, turned by `rpy` [rad] about the
-    fixed axes x, y, z. `file` is the file of a mesh, "" for other shapes.
-    """
-
-    kind: str
+    kind: str  # "box", "sphere", "cylinder" or "mesh"
+    # (x, y, z) of a box, (radius,) of a sphere, (radius, length) of a cylinder [m]; the scale (x,
+    # y, z) of a mesh
     size: tuple[float, ...]
-    xyz: Triple
-    rpy: Triple
-    file: str = ""
+    xyz: Triple  # position [m] of the shape in the link's frame
+    rpy: Triple  # rotation [rad] of the shape about the fixed axes x, y, z of this frame
+    file: str = ""  # file of a mesh; "" for other shapes
 
     @property
     def half(self) -> Triple:
@@ -89,42 +87,35 @@ class LinkShape:
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """A rigid link of a URDF.
+    """A rigid link of a URDF."""
 
-    `com` [m] is the centre of `mass` [kg] in the link's frame. `inertia` [kg m^2] holds xx, xy, xz,
-    yy, yz, zz about it, along the link's axes. `shapes` are the collision shapes.
-    """
-
-    name: str
-    mass: float
-    com: Triple
+    name: str  # name of the link
+    mass: float  # mass [kg]
+    com: Triple  # centre of mass [m] in the link's frame
+    # moments of inertia xx, xy, xz, yy, yz, zz [kg m^2] about the centre of mass, along the link's
+    # axes
     inertia: tuple[float, ...]
-    shapes: tuple[LinkShape, ...]
+    shapes: tuple[LinkShape, ...]  # its collision shapes
 
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint between the links `parent` and `child`; its `kind` is "revolute", "prismatic",
-    "continuous" or "fixed".
+    """A joint of a URDF, between two links."""
 
-    The joint's frame is at `xyz` [m] in the parent's frame, turned by `rpy` [rad] about the fixed
-    axes x, y, z. `axis` is its unit axis in this frame. `lower` and `upper` [rad or m] are the
-    limits, 0 for a fixed joint, infinite if the URDF has none. `effort` [N m or N] and `velocity`
-    [rad/s or m/s] are the greatest ones, 0 if the URDF has none. `mimic` is the coupling, None for
-    an independent joint.
-    """
-
-    name: str
-    kind: str
-    parent: str
-    child: str
-    xyz: Triple
+    name: str  # name of the joint
+    kind: str  # "revolute", "prismatic", "continuous" or "fixed"
+    parent: str  # name of the link nearer to the root
+    child: str  # name of the link that the joint moves
+    xyz: Triple  # position [m] of the joint's frame in the parent's frame
+    # rotation [rad] of the joint's frame about the fixed axes x, y, z of the parent's frame
     rpy: Triple
-    axis: Triple = (1.0, 0.0, 0.0)
+    axis: Triple = (1.0, 0.0, 0.0)  # unit axis in the joint's frame
+    # lower limit [rad or m]; 0 for a fixed joint, -infinity if the URDF has none
     lower: float = 0.0
-    upper: float = 0.0
-    effort: float = 0.0
-    velocity: float = 0.0
+    upper: float = 0.0  # upper limit [rad or m]; 0 for a fixed joint, infinity if the URDF has none
+    effort: float = 0.0  # greatest torque or force [N m or N]; 0 if the URDF has none
+    velocity: float = 0.0  # greatest speed [rad/s or m/s]; 0 if the URDF has none
+    # how its position follows other joints; None for an independent joint
     mimic: Mimic | None = None
 
     @property
@@ -137,19 +128,15 @@ class Joint:
 
 @dataclasses.dataclass(frozen=True)
 class Urdf:
-    """A checked URDF, with its links and joints in the order of the file.
+    """A checked URDF, with its links and joints in the order of the file."""
 
-    `root` is the name of the root link. `data` holds the bytes of the file, `xml` a copy with only
-    the checked links and joints.
-    """
-
-    path: Path
-    name: str
-    root: str
-    links: tuple[Link, ...]
-    joints: tuple[Joint, ...]
-    data: bytes
-    xml: bytes
+    path: Path  # path of the file
+    name: str  # name of the robot
+    root: str  # name of the root link
+    links: tuple[Link, ...]  # its links
+    joints: tuple[Joint, ...]  # its joints
+    data: bytes  # the bytes of the file
+    xml: bytes  # a copy of the file with only the checked links and joints
 
     @checked
     def wrong(self, found: str, allowed: str) -> HandFileError:

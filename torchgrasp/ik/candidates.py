@@ -45,15 +45,17 @@ class CheckNumbers:
     """Parameters of the checks of a candidate grasp and of its geometric score."""
 
     angle: float = math.radians(2)
-    """Largest angle [rad] of a contact direction outside the pad's cone."""
+    """Greatest angle [rad] by which a contact direction may lie outside the pad's cone."""
     limits: float = 1e-9
-    """Rounding [rad] by which a joint may pass its limits."""
+    """Distance [rad] by which rounding may move a joint past its limits."""
     least_cosine: float = 1e-3
     """Least cosine between a force and the inward normal for which friction is computed."""
     offset: float = 0.02
-    """Offset [m] of the contacts from the centre that lowers the score by 1, as a friction of 1."""
+    """Offset [m] of the contacts from the object's centre that lowers the score by 1. A needed
+    friction of 1 does so, too.
+    """
     pad_angle: float = 0.8
-    """Angle [rad] from the pad's axis that lowers the score by 1, as a friction of 1."""
+    """Angle [rad] of a contact direction from the pad's axis that lowers the score by 1."""
 
 
 CHECKS = CheckNumbers()
@@ -152,35 +154,34 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Hand configurations to check, g in number, each with its contacts in the order of the
-    fingers.
+    """Hand configurations to check, g in number, each with the contacts that its f fingers touch.
 
-    `certificate` is that of the contacts' force closure, and `status` the `Status` of contact
-    planning. `contacts` [m] and poses are in the object's frame. Finger i touches contact
-    `permutation[:, i]` of the planned contact set.
+    Contacts and poses are in the object's frame [m].
     """
 
+    # poses of the hand and positions of its actuated joints
     configuration: Annotated[Configuration, Rows("g")]
-    contacts: Annotated[Contacts, Rows("g")]
+    contacts: Annotated[Contacts, Rows("g")]  # contact sets, each in the order of the fingers
+    # certificates of the contact sets' force closure
     certificate: Annotated[Certificate, Rows("g")]
+    # indices: finger i of grasp k touches contact `permutation[k, i]` of the planned contact set
     permutation: Int[Tensor, "g f"]
-    status: Int[Tensor, "g"]
+    status: Int[Tensor, "g"]  # `Status` code that contact planning gave each contact set
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspErrors(Batch):
-    """Errors and clearances of g grasps; `status` is the `Status` of the first error out of
-    tolerance.
+    """The errors and clearances of g grasps with f fingertips, by which grasps are accepted."""
 
-    `tip_error` [m] is the distance of each of the f tips from its contact. `normal_angle` [rad] is
-    the angle of the contact's inward normal from the pad's axis. `clearance` [m] is the least
-    clearance of the links from object, table, each other, and obstacles they must not touch.
-    """
-
+    # distance [m] of each fingertip from its contact
     tip_error: Annotated[Float[Tensor, "g f"], ANY]
+    # angle [rad] between the contact's inward normal and the axis of the finger's pad
     normal_angle: Annotated[Float[Tensor, "g f"], ANY]
+    # least clearance [m] of the links from object, table, each other, and obstacles that they must
+    # not touch; negative if they overlap
     clearance: Annotated[Float[Tensor, "g"], ANY]
+    # `Status` code of the first of these that is out of tolerance, else `OK`
     status: Int[Tensor, "g"]
 
 

@@ -27,21 +27,23 @@ class CobylaNumbers:
     """Parameters of the paper's grasp solver, SciPy's COBYLA."""
 
     angle: float = 0.01
-    """Unit of the variables [rad]: a fingertip moves by about a millimetre, as the distances do."""
+    """Unit [rad] of the joint variables: it moves a fingertip by about a millimetre, the unit of
+    distances.
+    """
     far: float = 20.0
-    """Clearance [mm] above which clearances are not distinguished."""
+    """Clearance [mm] above which clearances count as equal."""
     end: float = 0.05
-    """Trust region, in units of the variables, at which COBYLA stops."""
+    """Radius of COBYLA's trust region, in units of the variables, at which it stops."""
     start: float = 10.0
-    """Trust region at the start, in units of the variables."""
+    """Radius of COBYLA's trust region at the start, in units of the variables."""
     evaluations: int = 400
-    """Most evaluations of one run."""
+    """Greatest number of evaluations in one run of COBYLA."""
     together: int = 10
     """Number of initial guesses that are tried at a time."""
     grasps: int = 10
-    """Number of executable grasps that are enough."""
+    """Number of executable grasps after which no further initial guesses are tried."""
     seeds: int = 300
-    """Most initial guesses that are tried."""
+    """Greatest number of initial guesses that are tried."""
 
 
 COBYLA = CobylaNumbers()

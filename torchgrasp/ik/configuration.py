@@ -29,14 +29,10 @@ from torchgrasp.hand.kinematics import map_points
 @checked
 @dataclasses.dataclass(frozen=True)
 class Configuration(Batch):
-    """Configurations of a free-floating hand: actuated `joints` [rad or m] and `obj_from_hand`, its
-    pose (g, 4, 4) [m] in the object's frame.
+    """g configurations of a free-floating hand with h actuated joints."""
 
-    g counts configurations, and h actuated joints.
-    """
-
-    joints: Float[Tensor, "g h"]
-    obj_from_hand: Poses
+    joints: Float[Tensor, "g h"]  # positions [rad or m] of the actuated joints
+    obj_from_hand: Poses  # pose (g, 4, 4) [m] of the hand's root link in the object's frame
 
     @checked(gradients=True)
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "Configuration":
@@ -62,38 +58,36 @@ class Configuration(Batch):
 
 
 class ResidualRows(NamedTuple):
-    """k residuals of g configurations, with the factors of their derivatives with respect to q
-    motions of the hand.
+    """k residuals of each of g hand configurations, and what their Jacobian is computed from.
 
-    The q motions are three translations, three rotations, and those of the moved joints. `residual`
-    is a weighted length [mm], or a weighted error of a cosine. `wrench` holds its derivatives with
-    respect to a translation [m] and a rotation [rad] about the object's origin. The derivative with
-    respect to a motion is `wrench` times the twist of the motion where `moves` is 1. It is 0 where
-    `moves` is 0.
+    The hand has q motions: three translations, three rotations, and those of the moved joints. The
+    derivative of a residual by a motion is `wrench` times the twist of the motion
+    (`SpatialJacobian.twists`). It counts only where `moves` is 1.
     """
 
-    residual: Float[Tensor, "g k"]
+    residual: Float[Tensor, "g k"]  # weighted lengths [mm], or weighted errors of cosines
+    # derivatives of each residual by a translation [m] (3) and a rotation [rad] about the object's
+    # origin (3)
     wrench: Float[Tensor, "g k 6"]
-    moves: Float[Tensor, "*g k q"]
+    moves: Float[Tensor, "*g k q"]  # 1 where a motion changes a residual, else 0
 
 
 @dataclasses.dataclass(frozen=True)
 class SpatialJacobian(Value):
-    """The kinematics of a hand at g configurations, from which Jacobians are computed, in the
-    object's frame.
+    """The kinematics of a hand at g configurations, from which Jacobians are computed. All is in
+    the object's frame.
 
-    `obj_from_link` are the poses (3 x 4) [m] of the l links. `spheres` [m] are the centres of the s
-    collision spheres, and `tips` [m] those of the f fingertips. `pads` are the unit normals of
-    their pads. `twists` are those of the q motions of the hand: the velocity at the object's
-    origin, then the rotation. Letters in shapes: g configurations, q motions (three translations,
-    three rotations, and the moved joints), h actuated joints, d = 6 + h.
+    Letters in shapes: l links, s collision spheres, f fingertips, and q motions of the hand. The
+    motions are three translations, three rotations, and those of the moved joints. A step has d = 6
+    + h numbers, for the pose and the h actuated joints.
     """
 
-    hand: Hand
-    obj_from_link: Float[Tensor, "3 4 l g"]
-    spheres: Float[Tensor, "3 s g"]
-    tips: Float[Tensor, "3 f g"]
-    pads: Float[Tensor, "3 f g"]
+    hand: Hand  # the hand
+    obj_from_link: Float[Tensor, "3 4 l g"]  # poses (3 x 4) [m] of the links
+    spheres: Float[Tensor, "3 s g"]  # centres [m] of the collision spheres
+    tips: Float[Tensor, "3 f g"]  # centres [m] of the fingertips
+    pads: Float[Tensor, "3 f g"]  # outward unit normals of the fingertips' pads
+    # velocity at the object's origin (3) and rotation (3) that each motion causes
     twists: Float[Tensor, "6 q g"]
 
     @classmethod

@@ -118,19 +118,22 @@ def rank_pairs(
 ) -> Int[Tensor, "r count"]:
     """Return for each of r contact sets the `count` pairs of least cost, best first.
 
-    A pair is an assignment of contacts to fingers and a posture: a s + k is that of assignment a
-    and posture k. Only the `candidates` pairs of the least `energy` are placed. The cost [mm2] is
-    `weight` times the energy, plus the `collision_cost` of the placed hand.
+    A pair joins an assignment of contacts to fingers (a in number) and a posture (s in number). Pair
+    i s + j is that of assignment i and posture j, so that p = a s. The cost [mm2] of a pair is
+    `weight` times its energy, plus the `collision_cost` of the hand that is so placed.
 
     Args:
-        energy: half the squared distance of features, without unit, of each of the p pairs.
-        obj_from_vf: virtual frame [m] of the contacts in each assignment.
-        vf_from_hand: pose [m] of the hand in the virtual frame of each of s postures.
-        centres: centres [m] of the k collision spheres in the hand's frame.
+        energy: half the squared distance of the features of posture and contacts, without unit, for
+            each of the p pairs.
+        obj_from_vf: pose [m] of the virtual frame of the contacts in the object's frame, in each
+            assignment.
+        vf_from_hand: pose [m] of the hand in the virtual frame of each posture.
+        centres: centres [m] of the k collision spheres in the hand's frame, in each posture.
         spheres: the collision spheres of the hand.
-        world: what the hand must keep clear of, in the object's frame.
+        world: what the hand must not touch, in the object's frame.
         weight: cost [mm2] of an energy of 1.
-        candidates: number of pairs of each contact set whose cost is computed.
+        candidates: number of pairs of each contact set, those of least energy, whose cost is
+            computed.
         count: number of pairs that are returned.
     """
     pairs = torch.empty(len(energy), count, dtype=torch.int64)

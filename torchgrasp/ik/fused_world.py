@@ -19,18 +19,22 @@ from torchgrasp.ik.clearance import CLEARANCE, CollisionWorld
 
 
 class WorldPart(NamedTuple):
-    """A part of a hand's surroundings: a grid of distances [m] (`kind` 2), a plane (1), or nothing
-    (0).
+    """A thing that a hand must not touch (the object, the obstacles or the table), for compiled
+    loops.
 
-    The numbers `grown` (s,) [m] are added to the distance of each sphere's centre to give its
-    clearance.
+    It is a grid of signed distances, negative inside the thing, or a plane, or nothing. Here s
+    counts the collision spheres of the hand.
     """
 
-    kind: int
-    values: np.ndarray  # distances [m] at the grid's nodes, in one row; empty for a plane
-    origin: np.ndarray  # first node [m] of the grid; of a plane its unit normal
-    shape: np.ndarray  # numbers of nodes along the three axes
+    kind: int  # 0: nothing; 1: a plane, the table; 2: a grid, of the object or the obstacles
+    # signed distances [m] at the grid's nodes, those along z adjacent; empty for a plane
+    values: np.ndarray
+    # position (3,) [m] of node (0, 0, 0) of the grid; for a plane its unit normal
+    origin: np.ndarray
+    shape: np.ndarray  # number of nodes (3,) along the three axes; 0 for a plane
     spacing: float  # distance [m] of neighbouring nodes; of a plane its offset from the origin
+    # numbers (s,) [m]: the distance of a sphere's centre plus its number is the sphere's clearance;
+    # infinite if the sphere may touch this thing
     grown: np.ndarray
 
 
@@ -55,8 +59,11 @@ def place(frame, v):
 
 @inlined
 def coarse_clearance(part, p):
-    """Return the height [m] of a point `p` [m] over a plane; of a grid, the distance [m] at the
-    nearest node.
+    """Return the distance [m] of a point `p` [m] from a `WorldPart`, without the radius of a
+    sphere.
+
+    It is the height over a plane. In a grid it is the signed distance at the node nearest to the
+    point.
     """
     if part.kind == 1:
         return dot(p, part.origin) - part.spacing
@@ -70,10 +77,16 @@ def coarse_clearance(part, p):
 def world_parts(
     radius: Float[Tensor, "s"], touching: Bool[Tensor, "s"], world: CollisionWorld
 ) -> tuple[WorldPart, ...]:
-    """Return object, obstacles and table of a world, in this order; what does not exist has kind 0.
+    """Return the object, the obstacles and the table of `world`, in this order, for compiled loops.
 
-    `radius` [m] holds the radii of s collision spheres. The spheres in the mask `touching` may
-    touch object and table.
+    What does not exist in the world has the `kind` 0. The field `grown` turns distances of the
+    spheres' centres into clearances: it is minus their radius. Spheres of fingertips may touch the
+    object, so it is infinite there. At the table, their clearance is raised by a constant.
+
+    Args:
+        radius: radii (s,) [m] of the s collision spheres of the hand.
+        touching: mask (s,) of the spheres on fingertips, which may touch object and table.
+        world: what the hand must not touch.
     """
     none = np.zeros(0)
     size = np.zeros(3, np.int64)

@@ -55,15 +55,11 @@ CONTACT_WEIGHT = 2.0  # weight of a millimetre of the contact problem: contacts 
 
 
 class SlidingStage(NamedTuple):
-    """A stage of the solver.
+    """A stage of the solver that optimises hand posture and contacts together."""
 
-    `steps` is the number of its steps, and `flat` says whether contacts must be on flat surface.
-    `hopeless` [mm2] is the cost from which a grasp is given up after the stage.
-    """
-
-    steps: int
-    flat: bool
-    hopeless: float
+    steps: int  # greatest number of solver steps in the stage
+    flat: bool  # whether contacts must be where the surface is flat
+    hopeless: float  # cost [mm2] from which on a grasp is given up after the stage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +67,7 @@ class SlidingNumbers:
     """Parameters of the optimisation of hand posture and contacts together."""
 
     seeds: int = 2
-    """Number of tried initial guesses of a contact set: more guesses find few other grasps."""
+    """Number of initial guesses of a contact set that are tried: more find few other grasps."""
     rows: int = 512
     """Number of initial guesses that are optimised at a time on a CPU."""
     most_rows: int = 2**15
@@ -91,18 +87,20 @@ STAGES = (
 
 @dataclasses.dataclass(frozen=True)
 class JointState(Batch):
-    """The unknowns of g grasps: hand configurations, contact points and tensions, with the
-    surface's variance.
+    """The unknowns of the optimisation of hand posture and contacts together, for g grasps of f
+    contacts.
 
-    `points` are normalised, and `tension` (no unit) is that of each of the k pairs of contacts.
-    `variance` [squared normalised units] is that of the surface's distance at the points,
-    extrapolated linearly by `variance_gradient` [normalised units].
+    Points and variances are in normalised units of the shape.
     """
 
-    configuration: Configuration
-    points: Float[Tensor, "g f 3"]
+    configuration: Configuration  # poses of the hand and positions of its actuated joints
+    points: Float[Tensor, "g f 3"]  # contact points, normalised
+    # tension (no unit) of each of the k pairs of contacts, which pull each other with the force
+    # tension times distance
     tension: Float[Tensor, "g k"]
+    # variance of the surface's signed distance at the points, in squared normalised units
     variance: Float[Tensor, "g f"]
+    # gradient of this variance, by which it is extrapolated linearly [normalised units]
     variance_gradient: Float[Tensor, "g f 3"]
 
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "JointState":
@@ -126,16 +124,12 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """The least-squares problem of hand and contacts together.
+    """The least-squares problem of hand posture and contacts together, for a batch of grasps."""
 
-    `shape` is the estimated shape, or a batch of one for each grasp. `contact_problem` holds the
-    constraints of the contacts, and `world` what the hand must not touch.
-    """
-
-    hand: Hand
-    shape: ShapeLike
-    contact_problem: ContactProblem
-    world: CollisionWorld
+    hand: Hand  # the hand
+    shape: ShapeLike  # the estimated shape, or a batch of one for each grasp
+    contact_problem: ContactProblem  # the constraints on the contacts, in normalised units
+    world: CollisionWorld  # what the hand must not touch
 
     def rows(self, index: Int[Tensor, "k"]) -> "JointProblem":
         """Return the problems of the k grasps with the indices `index` in the batch."""

@@ -39,13 +39,14 @@ class MotionNumbers:
     """Parameters of the motion of a grasp: pose of the opened hand, approaches and lift."""
 
     gap: float = 0.001
-    """Clearance [m] from the table of a hand that is raised."""
+    """Clearance [m] from the table to which the opened hand is raised, if it would be in the table.
+    """
     most: float = 0.03
-    """Greatest rise [m] of a hand above its pose."""
+    """Greatest height [m] by which the opened hand is raised above its pose."""
     tilt: float = math.radians(45)
-    """Angle [rad] of the tilted approaches from the hand's axis."""
+    """Angle [rad] between the tilted approaches and the hand's own approach axis."""
     tilted: int = 8
-    """Number of tilted approaches, at equal angles about the axis."""
+    """Number of tilted approaches, at equal angles about this axis."""
     nodes: float = 1.2
     """Largest error of a clearance at the nearest grid node, in grid spacings."""
     closing_steps: int = 6

@@ -37,17 +37,21 @@ class PressNumbers:
     directions: int = 400
     """Number of directions, over the whole sphere, in which each posture is tried as pressing."""
     level: float = 0.003
-    """Largest difference [m] of the heights of two tips; the hand is then turned to level them."""
+    """Greatest difference [m] of the heights of two pressing tips. The hand is then turned to level
+    them.
+    """
     gap: float = 0.006
     """Least distance [m] by which all else of the hand is higher than the pressing tips."""
     cosine: float = 0.5
-    """Least cosine between a pad's axis and the direction of pressing: its cone has 60 degrees."""
+    """Least cosine between a pad's axis and the direction of pressing: 60 degrees."""
     apart: float = 0.02
     """Least distance [m] of two pressing tips, so that they resist a turn of the object."""
     weakest: float = 5.0
     """Least normal force [N] of a pressing finger: a quarter of a kilogram slides with it."""
     strongest: float = 60.0
-    """Greatest normal force [N]: a stretched finger does not give way, and is hard to control."""
+    """Greatest normal force [N] of a pressing finger. A stretched finger does not give way, and is
+    hard to control.
+    """
     compliance: float = 1e-5
     """Compliance [m/N] of gears and links, which every fingertip has in all directions."""
     kept: int = 200

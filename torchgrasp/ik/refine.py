@@ -46,7 +46,7 @@ class OpeningNumbers:
     solved: float = 1.0
     """Sum of squared residuals [mm2] of an opened hand: half a millimetre at a tip."""
     steps: int = 12
-    """Most steps of the optimisation."""
+    """Greatest number of steps of the optimisation."""
 
 
 OPENING = OpeningNumbers()

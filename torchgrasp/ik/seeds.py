@@ -52,7 +52,9 @@ class SeedNumbers:
     postures: int = 5000
     """Number of random postures in the library of a hand with three fingers."""
     many_postures: int = 20_000
-    """This number for a hand with more fingers, whose contact sets have more shapes."""
+    """Number of random postures in the library of a hand with more fingers, whose contact sets have
+    more shapes.
+    """
     candidates: int = 64
     """Number of nearest postures of a contact set that are checked for clearance."""
     assignments: int = 6
@@ -60,7 +62,9 @@ class SeedNumbers:
     compared: int = 500
     """Number of postures of the library by which these assignments are chosen."""
     spare: int = 3
-    """Ratio of the postures that are checked for reachability to the wanted initial guesses."""
+    """Ratio of the number of postures that are checked for reachability to that of the wanted
+    initial guesses.
+    """
     wrong_side: float = 0.3
     """Mean cosine of the normals of tips and contacts above which an initial guess touches from
     inside.

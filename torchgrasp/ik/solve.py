@@ -41,13 +41,13 @@ class SolveNumbers:
     exact: float = 5e-5
     """Largest tip error [m] of a solution that ends the search."""
     library_seeds: int = 8
-    """Number of initial guesses for a contact set from the library."""
+    """Number of initial guesses for a contact set that are taken from the library of postures."""
     learned_seeds: int = 2
-    """Number of initial guesses for a reachable assignment from the model: the mean and one
-    component.
+    """Number of initial guesses from the learned model for a reachable assignment of contacts to
+    fingers. They are the mean and one component.
     """
     learned_tries: int = 4
-    """Number of initial guesses for a contact set from the model that are refined."""
+    """Number of initial guesses from the learned model for a contact set that are refined."""
     part: int = 512
     """Number of initial guesses refined at a time: their temporaries stay in the cache."""
 

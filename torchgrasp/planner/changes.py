@@ -17,22 +17,29 @@ from torchgrasp.scene.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class ChangeNumbers:
-    """The values to which a limit or a property is changed, in ascending order."""
+    """The values to which a limit or a property of a request is changed, and bounds of these
+    changes.
+    """
 
     frictions: tuple[float, ...] = (0.4, 0.8, 1.2)
-    """Coefficients of friction: of smooth plastic, of rubber, of soft silicone."""
+    """Coefficients of friction that are tried: of smooth plastic, of rubber, of soft silicone."""
     clearly: float = 1.4
-    """A friction is tried if it is at least this multiple of the present one."""
+    """Least ratio of a tried friction to the present one."""
     tried: int = 2
-    """Largest number of frictions that are tried."""
+    """Greatest number of frictions that are tried."""
     variances: tuple[float, ...] = (0.03, 0.1)
-    """Largest variances of the surface at a contact, in normalised units."""
+    """Greatest variances of the surface at a contact that are tried, in squared normalised units.
+    """
     flatnesses: tuple[float, ...] = (0.44, 0.9)
-    """Largest angles [rad] between the normals at a contact and on a ring around it."""
+    """Greatest angles [rad] between the normals at a contact and on a ring around it that are
+    tried.
+    """
     margins: tuple[float, ...] = (0.5, 1.0)
-    """Values of `friction_margin`: shares of the friction that are planned with."""
+    """Values of `friction_margin` that are tried: shares of the friction with which contacts are
+    planned.
+    """
     compared: int = 1000
-    """Most points of an object whose distances to the target are computed."""
+    """Greatest number of points of an object whose distances to the target are computed."""
     beside: float = 0.15
     """Distance [m] from the target within which an object is its neighbour: a finger's reach."""
 

@@ -13,14 +13,18 @@ from torchgrasp.values.planning import Grasps
 
 @dataclasses.dataclass(frozen=True)
 class ClearingNumbers:
-    """Bounds on the search for objects to take away."""
+    """Bounds on the search for objects to take away, so that the target can be grasped."""
 
     compared: int = 4
-    """Most objects that are compared at once, the nearest: others are seldom in the way."""
+    """Greatest number of objects near the target of which the removal is tried in a step. They are
+    the nearest: others are seldom in the way.
+    """
     starts: int = 60
-    """Most initial guesses of each plan: counts are compared, no grasp is used."""
+    """Greatest number of initial guesses with which each of these removals is planned. Few suffice,
+    as only the numbers of executable grasps are compared.
+    """
     removed: int = 3
-    """Most objects that are taken away: after more, a new image is due."""
+    """Greatest number of objects that are taken away in all: after more, a new image is due."""
 
 
 CLEARING = ClearingNumbers()

@@ -34,31 +34,40 @@ class DragNumbers:
     """Parameters of a drag to the edge."""
 
     behind: float = 0.015
-    """Least distance [m] behind the edge at which the centre of mass ends."""
+    """Least distance [m] of the centre of mass behind the table's edge, over the table, at the end
+    of the drag.
+    """
     unsure: float = 0.25
-    """The same as a share of the object's extent from its centre towards the edge: so far off are
-    estimates. The greater distance counts.
+    """The same distance as a share of the object's extent from its centre towards the edge.
+    Estimates of the centre are so far off. The greater distance counts.
     """
     farthest: float = 2.0
-    """Largest distance [m] of the edge from the points of the view: a larger one is in another unit."""
+    """Greatest distance [m] of the edge from the points of the view: a greater one is in another
+    unit.
+    """
     supported: float = 0.004
     """Least distance [m] behind the edge of each pressing tip at the end of the drag."""
     spacing: float = 0.008
-    """Distance [m] of the places on the object's top where the hand may press."""
+    """Distance [m] between the places on the object's top where the hand may press."""
     cell: float = 0.001
     """Spacing [m] of the map of the object's top."""
     places: int = 60
     """Number of these places that are tried, those nearest to the centre of mass."""
     postures: int = 40
-    """Number of postures of two tips, and of one, that are tried at each place."""
+    """Number of postures that press with two tips, and number of those with one, that are tried at
+    each place.
+    """
     turns: int = 24
     """Number of directions about the vertical in which each posture is tried."""
     upward: float = 0.9
-    """Least upward part of the unit normal where a tip presses: 25 degrees."""
+    """Least component along the upward direction of the surface's unit normal where a tip presses:
+    25 degrees.
+    """
     rim: float = 0.002
-    """Distance [m] of a pressing tip from the object's outline."""
+    """Least distance [m] of a pressing tip from the outline of the object's top."""
     ring: int = 8
-    """Number of points on the circle of radius `rim` that must lie on the object's top."""
+    """Number of points on the circle of this radius about a tip that must lie on the object's top.
+    """
     flat: float = 0.003
     """Largest difference [m] of heights on this circle."""
     near: float = 0.0025
@@ -70,40 +79,46 @@ class DragNumbers:
     lowered: int = 6
     """Number of heights at which the hand is checked on its way down."""
     approach: float = 0.05
-    """Height [m] from which the hand comes down."""
+    """Height [m] above its pressing pose from which the hand comes down."""
     steps: int = 8
     """Number of places on the way along the table at which hand and object are checked."""
     unloading: float = 0.1
-    """Greatest loss of pressing force for each newton of the drag: then the tips would slip."""
+    """Greatest loss [N/N] of pressing force for each newton of the drag: with more the tips would
+    slip.
+    """
     digging: float = 0.8
-    """Greatest gain of pressing force for each newton of the drag: then the tips would jam."""
+    """Greatest gain [N/N] of pressing force for each newton of the drag: with more the tips would
+    jam.
+    """
     reserve: float = 3.0
-    """Ratio of the pressing force to the least one that moves the object."""
+    """Wanted ratio of the pressing force to the least one that moves the object."""
     weights: float = 2.0
     """Least ratio of the pressing force to the weight: the tips then resist a turn."""
     pivot: float = 0.004
     """Largest distance [m] of the centre of mass from the line along which one tip drags."""
     share: float = 0.25
-    """Share of the friction of two tips that is left to resist a turn."""
+    """Share of the friction of two pressing tips that is left to resist a turn of the object."""
     support: float = 0.005
     """Distance [m] before and behind a pressing tip to which the top must reach: else it rolls."""
     carried: float = 1.5
-    """Ratio of the load that grasps must resist to the weight: its lever is known to a third."""
+    """Ratio of the load that the grasps after the drag must resist to the weight. The lever of the
+    weight is known to a third.
+    """
     least: float = 1.0
     """Least pressing force [N]: sensors are off by 0.1 N."""
     most: float = 20.0
-    """Greatest pressing force [N]: thin things bend, and hands are weak."""
+    """Greatest pressing force [N], as thin things bend and hands are weak."""
     enough: float = 1.5
     """Least ratio of the pressing force to the least one, for an object that needs more than `most`.
     """
     sure: float = 0.1
-    """Probability that friction is less than the one that the drag counts on."""
+    """Probability that the friction is less than that on which the drag counts."""
     sunk: float = 0.005
     """Greatest depth [m] of a pressing tip in the estimated shape: estimates are a few mm off."""
     ended: float = 0.85
     """Share of simulated drags of authored bodies that ended as planned."""
     shortest: float = 0.002
-    """Length [m] of a drag that is not worth while: sensors are off by as much."""
+    """Length [m] up to which a drag is not worth while: sensors are off by as much."""
 
 
 DRAG = DragNumbers()

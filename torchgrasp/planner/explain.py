@@ -36,21 +36,23 @@ class ExplainNumbers:
     """Bounds on the work of explaining why a plan has no grasp, and weights of changes to try."""
 
     trials: int = 8
-    """Largest number of changes that are tried."""
+    """Greatest number of changes that are tried."""
     starts: int = 20
     """Number of initial guesses with which a change is tried: one takes about a second."""
     more: int = 4
-    """Ratio by which more initial guesses are tried; only requests of few guesses are tried so."""
+    """Factor by which more initial guesses are tried as a change, for requests of few guesses."""
     postures: int = 500
-    """Size of the posture library; more take seconds for a hand that often meets itself."""
+    """Number of postures in the library: more take seconds for a hand that often meets itself."""
     judged: int = 5
-    """A plan of n initial guesses is judged by its best n / `judged` grasps."""
+    """Divisor: a plan of n initial guesses is judged by its best n / `judged` grasps."""
     enough: float = 0.8
-    """Expected success at which a change is good enough to end the search."""
+    """Expected success from which on a change is good enough to end the search."""
     beside: float = 0.2
-    """Weight of other failures of a stage, since a failed set reports only one of its failures."""
+    """Weight of a stage's other failures, in [0, 1], as a failed set reports only one of its
+    failures.
+    """
     least: float = 0.25
-    """Changes of less weight, as a share of the greatest, are not tried."""
+    """Least weight of a change that is tried, as a share of the greatest weight."""
 
 
 EXPLAIN = ExplainNumbers()

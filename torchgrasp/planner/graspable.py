@@ -32,11 +32,13 @@ class JudgeNumbers:
     """Bounds on the points and pixels of an object beyond which a hand cannot grasp it."""
 
     on_support: float = 0.5
-    """Least share of an object's points over its support."""
+    """Least share of an object's points that are over its support."""
     top: float = 0.98
-    """Quantile of the heights of an object's points that is its top."""
+    """Quantile of the heights of an object's points that counts as its top."""
     high: float = 0.9
-    """Quantile of the heights of an object's points that must be high enough for fingertips."""
+    """Quantile of the heights of an object's points that must be high enough above the table for
+    fingertips.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,19 +66,19 @@ class EaseNumbers:
     """Parameters of the order in which the objects of a scene are planned."""
 
     room: float = 0.06
-    """Free space [m] around an object above which more space does not raise its rank."""
+    """Free space [m] around an object above which more space does not raise the object's rank."""
     height: float = 0.08
-    """Height [m] of an object above which a larger height does not raise its rank."""
+    """Height [m] of an object above which a larger height does not raise the object's rank."""
     side: float = 0.01
-    """Side [m] of a column of points."""
+    """Side [m] of the vertical columns in which points are counted."""
     top: float = 0.95
-    """Quantile of the heights of an object's points that is its height."""
+    """Quantile of the heights of an object's points that counts as its height."""
     covered: float = 5.0
-    """Weight of the share of an object's columns that have something above them; the product counts
+    """Weight of the share of an object's columns that have something above them. The product counts
     as at most 1.
     """
     columns: int = 2**16
-    """Cells of the grid along an axis, of which half are at negative coordinates."""
+    """Number of cells of the grid along an axis, of which half are at negative coordinates."""
 
 
 JUDGE = JudgeNumbers()

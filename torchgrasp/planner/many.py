@@ -30,9 +30,11 @@ class ManyNumbers:
     """Bounds on plans of many clouds at once."""
 
     stack: int = 128
-    """Clouds that a device plans at once; with more it would wait longer for the shapes."""
+    """Number of clouds that a device plans at once. With more, it would wait longer for their
+    shapes.
+    """
     patience: float = 3600.0
-    """Time after which a worker process gives up a cloud [s]."""
+    """Time [s] after which a worker process gives up a cloud."""
 
 
 MANY = ManyNumbers()

@@ -72,13 +72,12 @@ CloudIndex = Int[Tensor, "b"]
 
 
 class LearnedModel(NamedTuple):
-    """The learned posture mixture of a planning mode, and the SHA-256 of its file.
-
-    In the mode "joint", which uses no mixture, they are None and "none".
+    """The learned posture model that a planning mode uses, a mixture of Gaussians. The mode "joint"
+    uses none.
     """
 
-    mixture: GraspMixture | None = None
-    sha256: str = "none"
+    mixture: GraspMixture | None = None  # the model; None in the mode "joint"
+    sha256: str = "none"  # SHA-256 of its file; "none" without a model
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +105,9 @@ class ShapedObject:
 
     @classmethod
     def of(cls, request: Request) -> "ShapedObject":
-        """Return the object of a request in its upright frame, with its estimated shape."""
+        """Return the object of a planning request in its upright frame (z up), with its estimated
+        shape.
+        """
         # seen: the object's points, the table, and the frame in which z points up
         cloud = request.cloud
         spec = request.contact_spec

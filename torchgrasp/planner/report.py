@@ -20,16 +20,17 @@ class ReportNumbers:
     """Parameters of the report on the estimated shape."""
 
     vertices: int = 500
-    """Largest number of vertices at which the surface is judged."""
+    """Greatest number of vertices at which the certainty of the surface is judged."""
     certain: float = 0.004
-    """Standard deviation [m] below which the surface is certain: it moves a contact little."""
+    """Standard deviation [m] below which the surface counts as certain: it moves a contact little.
+    """
 
 
 REPORT = ReportNumbers()
 
 
 class Report:
-    """Reports of the progress of a plan to the observer.
+    """What tells the observer of a plan about its progress; without an observer it does nothing.
 
     Each stage is reported once with the results of all batches, and the end of each batch is
     reported.

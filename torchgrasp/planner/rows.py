@@ -56,17 +56,22 @@ class ChoiceNumbers:
     """Parameters by which planned contact sets are chosen for the hand to try."""
 
     likely: int = 2
-    """Farthest-point sampling takes n sets to try from the `likely` * n sets of least cost."""
+    """Number of sets of least cost, for each set to try, among which farthest-point sampling
+    chooses.
+    """
     weak: float = 1e6
-    """Cost of contact sets that resist less than the task's loads: above all other costs."""
+    """Cost of a contact set that does not resist the task's loads: above all other costs."""
     tried: int = 2
     """Number of a contact set's initial postures that count for its cost: as many as the solver
     refines.
     """
     lever: float = 0.3
-    """Weight of the load's lever arm relative to the fingertips' errors, both as logarithms."""
+    """Weight of the load's lever arm in the cost relative to the fingertips' errors, both as
+    logarithms.
+    """
     short: float = 0.1
-    """Lever arm (no unit, of `lever_arm`) below which differences of lever arms hardly count."""
+    """Lever arm (no unit, of `lever_arm`) that is added to all: below it, differences hardly count.
+    """
     touching: float = 1e-3
     """Sum of squared errors [mm2] below which initial postures count as equally near."""
 

@@ -15,10 +15,10 @@ class ScheduleNumbers:
     growth: int = 6
     """Ratio of the sizes of successive batches."""
     tried: int = 250
-    """Largest number of contact sets that the hand tries."""
+    """Greatest number of contact sets that the hand tries in a plan."""
     tried_in_scene: int = 160
-    """Largest number of contact sets that the hand tries in a scene. They are fewer, because there
-    it tries more postures for each set.
+    """Greatest number of contact sets that the hand tries in a plan of a scene. They are fewer,
+    because it tries more postures for each set there.
     """
     offered: int = 4
     """Number of planned contact sets for each one that the hand tries."""
@@ -28,13 +28,10 @@ SCHEDULE = ScheduleNumbers()
 
 
 class BatchSize(NamedTuple):
-    """The size of a batch of a plan.
+    """The size of one batch of a plan; a plan has several, one after the other."""
 
-    The batch has `starts` new initial guesses, and the hand tries `tried` contact sets.
-    """
-
-    starts: int
-    tried: int
+    starts: int  # number of new initial guesses of the contact planner in the batch
+    tried: int  # number of contact sets that the hand tries in the batch
 
 
 def batch_sizes(mode: Mode, starts: int, crowded: bool) -> list[BatchSize]:

@@ -28,17 +28,21 @@ class EmNumbers:
     """Parameters of expectation-maximisation and of its start by k-means."""
 
     cached_rows: int = 2048
-    """Number of samples (data rows) in one pass: their features and responsibilities stay in the
-    cache.
+    """Number of samples (data rows) in one pass on a CPU. Their features and responsibilities stay
+    in the cache.
     """
     device_rows: int = 2**17
     """Number of samples in one pass on a GPU, which smaller passes leave idle."""
     singular: float = 1e-12
-    """Greatest conditional variance that is only rounding; the data's variance is 1."""
+    """Greatest conditional variance that counts as rounding; the variance of the data is 1."""
     most_reseeds: int = 3
-    """Most times that a component may collapse: with more, the data support fewer components."""
+    """Greatest number of times that a component may collapse: with more, the data support fewer
+    components.
+    """
     drawn: int = 20_000
-    """Number of samples from which k-means++ draws: some hundred for each component."""
+    """Number of samples from which k-means++ draws the first means: some hundred for each
+    component.
+    """
     lloyd_steps: int = 10
     """Number of steps of k-means. EM follows, so the clusters need not converge."""
 
@@ -48,25 +52,28 @@ EM = EmNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class EmRule:
-    """The bounds that end a fit, and the variance that it adds."""
+    """The bounds at which a fit by expectation-maximisation (EM) ends, and the variance that it
+    adds.
+    """
 
     iterations: int
-    """Most EM steps, including those that were made before the state from which the fit starts."""
+    """Greatest number of EM steps, including those before the state from which the fit starts."""
     tolerance: float
-    """Least rise [nats] of the mean log-likelihood in a step that goes on."""
+    """Least rise [nats] of the mean log-likelihood in a step, after which the fit goes on."""
     regularisation: float
-    """Added to every variance of a component; the variance of the data is 1."""
+    """Variance that is added in each dimension of a component; the variance of the data is 1."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DataRows:
-    """The data rows of one process.
+    """The samples (data rows) that one process has in a fit by several processes.
 
-    Several processes form the default group of torch.distributed.
+    These processes form the default group of torch.distributed.
     """
 
-    rows: Float[Tensor, "n d"]  # n standardised samples of d numbers
-    rank: int = 0  # index of this process
+    # n samples of d numbers, standardised: each dimension has mean 0 and variance 1
+    rows: Float[Tensor, "n d"]
+    rank: int = 0  # index of this process among all
     processes: int = 1  # number of processes
 
     @staticmethod

@@ -253,10 +253,13 @@ class GaussianMixture(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Whitening:
-    """The m Gaussians of a mixture in whitened form, without their weights."""
+    """The m Gaussians of a mixture in whitened form: W (x - mean) is standard normal for a sample x
+    of one. The weights are not included.
+    """
 
-    matrix: Float[Tensor, "m d d"]  # lower-triangular W with W^T W = covariance^-1
-    means: Float[Tensor, "m d"]  # W mean (no unit)
+    # lower-triangular matrix W of each Gaussian, with W^T W = covariance^-1
+    matrix: Float[Tensor, "m d d"]
+    means: Float[Tensor, "m d"]  # W times the mean of each Gaussian (no unit)
     log_scale: Float[Tensor, "m"]  # log-density [nats] of each Gaussian at its mean
 
     def squared(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:

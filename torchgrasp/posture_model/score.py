@@ -32,23 +32,24 @@ GROWING = EmRule(iterations=100, tolerance=1e-3, regularisation=MAX_REGULARISATI
 
 @dataclasses.dataclass(frozen=True)
 class MixtureScore(Value):
-    """Errors with which a learned model predicts the h joints of held-out postures from their
-    contact codes.
+    """The errors with which a learned posture model predicts the h joints of held-out postures,
+    given their contact codes.
 
-    Errors of sliding joints are in [m] in place of [rad].
+    Errors of sliding joints are in [m] in place of [rad]. The energy of a code tells whether the
+    hand can reach such contacts; less is better.
     """
 
-    joint_names: tuple[str, ...]
+    joint_names: tuple[str, ...]  # names of the h joints
     # mean absolute error of each joint [rad], predicted by the conditional mean, Eq. (23)
     error: Float[Tensor, "h"]
     # standard deviation of the absolute error over the postures [rad]
     deviation: Float[Tensor, "h"]
     # mean absolute error [rad] of the best of the four (`COMPARED_MODES`) likeliest components
     nearest_mode: float
-    paper_coverage: float  # share of codes of energy below the paper's 2 (`PAPER_ENERGY`)
-    default_coverage: float  # share of codes of energy below 6.3 (`DEFAULT_ENERGY`)
-    log_likelihood: float  # mean log-likelihood of the postures [nats]
-    postures: int  # number of postures
+    paper_coverage: float  # share of the codes whose energy is below the paper's 2 (`PAPER_ENERGY`)
+    default_coverage: float  # share of the codes whose energy is below 6.3 (`DEFAULT_ENERGY`)
+    log_likelihood: float  # mean log-likelihood [nats] of the postures under the model
+    postures: int  # number of held-out postures
 
     @property
     def mean_error(self) -> float:
@@ -114,12 +115,12 @@ def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScor
 
 @dataclasses.dataclass(frozen=True)
 class BicCurve(Value):
-    """The Bayesian information criterion (BIC) for several numbers of components; smaller is
-    better.
+    """The Bayesian information criterion (BIC) of fits with k different numbers of Gaussians;
+    smaller is better.
     """
 
-    components: Int[Tensor, "k"]  # numbers of components
-    bic: Float[Tensor, "k"]  # BIC (no unit) of the fit with each of these numbers
+    components: Int[Tensor, "k"]  # number of Gaussians of each fit
+    bic: Float[Tensor, "k"]  # BIC (no unit) of each fit
 
     def __str__(self) -> str:
         """Return the BIC values as a table, with their minimum."""

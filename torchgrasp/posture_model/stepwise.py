@@ -32,15 +32,17 @@ rows, the likeliest fit is often not the likeliest on all rows.
 
 @dataclasses.dataclass(frozen=True)
 class Subsets:
-    """Nested random subsets of the data rows of all processes together.
+    """Nested random subsets of the samples (data rows) of all processes of a fit together.
 
-    `sizes` are the numbers of rows. The last is the number of all rows, every other is half of the
-    next, rounded down. What a subset contains does not depend on the number of processes.
+    What a subset contains does not depend on the number of processes.
     """
 
-    shard: DataRows  # all rows of this process
+    shard: DataRows  # all samples of this process
+    # number of samples of each subset, ascending: the last is that of all samples, every other is
+    # half of the next, rounded down
     sizes: tuple[int, ...]
-    # index of each row of this process in the random order of all rows; None: only all rows
+    # index of each sample of this process in the random order of all samples; a subset holds the
+    # first of this order. None means that all samples are the only subset.
     place: Int[Tensor, "n"] | None = None
 
     @staticmethod

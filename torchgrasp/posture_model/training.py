@@ -37,9 +37,13 @@ class MixtureNumbers:
     """Parameters of the fit of a Gaussian mixture to sampled postures."""
 
     trial_steps: int = 20
-    """Number of EM steps before starts are compared; a whole fit takes some hundred."""
+    """Number of EM steps of each start before the starts are compared. A whole fit takes some
+    hundred.
+    """
     constant: float = 1e-9
-    """Greatest standard deviation, over 1 + |mean|, of a dimension that counts as constant."""
+    """Standard deviation of a dimension, over 1 + |mean|, up to which the dimension counts as
+    constant.
+    """
     same: float = 1e-9
     """Greatest relative difference of means and deviations of the same data, summed in another
     order.
@@ -59,11 +63,11 @@ class Checkpoint:
     `settings` the fit.
     """
 
-    path: Path | None
+    path: Path | None  # path of the file; None means no file
     shard: DataRows  # data rows of this process
     centre: Float[Tensor, "d"]  # mean of each dimension of the data, in its unit
     scale: Float[Tensor, "d"]  # standard deviation of each dimension, in its unit
-    settings: dict[str, str]
+    settings: dict[str, str]  # settings of the fit, as texts by name
 
     def save(self, progress: FitProgress) -> None:
         """Write the state of the fit atomically; raise `OutputError` if that fails."""

@@ -21,25 +21,30 @@ class CreaseNumbers:
     reach: float = 0.012
     """Distance [m] on either side of a crease over which its angle is measured."""
     part: int = 300
-    """Pixels of the smallest part, in an image of 640 x 480."""
+    """Least number of pixels of a part that a crease cuts off, in an image of 640 x 480."""
     bend: float = 0.35
     """Least sine of the angle by which each side of a crease rises above the chord across it."""
     chord: float = 0.048
-    """Longest chord across a crease [m]: a longer one spans a jump of depth."""
+    """Greatest length [m] of the chord across a crease: a longer one spans a jump of depth."""
     border: int = 5
-    """Parts that share fewer pixels of border stay apart."""
+    """Least number of border pixels of two parts that may be joined again. Parts that share fewer
+    stay apart.
+    """
     near: float = 0.004
-    """Points nearer to the border than this [m] are on the crease, and rounded."""
+    """Distance [m] from the border within which points are on the crease, rounded, and do not count
+    for its angle.
+    """
     far: float = 0.025
-    """Points farther from the border than this [m] do not count for the angle of a crease."""
+    """Distance [m] from the border beyond which points do not count for the angle of a crease."""
     points: int = 20
-    """Fewest points of a side whose normal is known."""
+    """Least number of points of a side of a crease whose normal is fitted."""
     concave: float = 0.5
-    """Least sine of the angle by which each fitted side rises above the chord."""
+    """Least sine of the angle by which each fitted side of a concave crease rises above the chord.
+    """
     least_share: float = 1e-9
-    """Least share of averaged pixels, so that nothing is divided by 0."""
+    """Least share of averaged pixels that is a divisor, so that nothing is divided by 0."""
     least_length: float = 1e-12
-    """Least length [m], so that nothing is divided by 0."""
+    """Least length [m] that is a divisor, so that nothing is divided by 0."""
 
 
 CREASE = CreaseNumbers()

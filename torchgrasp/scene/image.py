@@ -33,13 +33,15 @@ class ImageNumbers:
     """Numbers of pixels by which objects in depth images are judged."""
 
     least_pixels: int = 30
-    """Fewest pixels of an object: fewer do not show its shape."""
+    """Least number of pixels of an object: fewer do not show its shape."""
     border_pixels: int = 5
-    """An object that reaches the border in fewer pixels is not cut: they are noise."""
+    """Least number of pixels at the image border of an object that is cut off there. Fewer are
+    noise.
+    """
     squares: int = 3
-    """Fewest measured depths in a square of 3 x 3 pixels whose median is taken."""
+    """Least number of measured depths in a square of 3 x 3 pixels whose median is taken."""
     usual: int = 640 * 480
-    """Pixels of the image for which counts of pixels are given."""
+    """Number of pixels of the image for which counts of pixels are given."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,13 +53,13 @@ class ProjectionNumbers:
     with a shorter one is from straight above: any direction is then taken as down.
     """
     widest: float = 75.0
-    """Widest angle from the middle of a view [deg]."""
+    """Greatest angle [deg] of a point from the middle of a view."""
     cells: int = 64
-    """Cells to a side of a view, of which those with points count as filled."""
+    """Number of cells to a side of a view, of which those with points count as filled."""
     inset: float = 0.001
     """Share of a cell by which the last point of a view lies inside the last cell."""
     most_steps: int = 1023
-    """Most pixels from one side of an image made of a cloud to the other."""
+    """Greatest number of pixels from one side of an image made of a cloud to the other."""
     least_extent: float = 1e-6
     """Least extent of a view at depth 1, so that nothing is divided by 0."""
 

@@ -24,11 +24,11 @@ class LeaningNumbers:
     """Bounds by which sides of objects lean alike."""
 
     points: int = 150
-    """Fewest points of an object whose sides are looked at."""
+    """Least number of points of an object whose sides are looked at."""
     drawn: int = 300
-    """Most points of an object at which planes are fitted."""
+    """Greatest number of points of an object at which planes are fitted."""
     objects: int = 5
-    """Most objects whose sides are looked at, the largest ones."""
+    """Greatest number of objects whose sides are looked at, the largest ones."""
     low: float = 0.2
     """Least height of points on a side, over that of the object: below, it blends into the table."""
     high: float = 0.8
@@ -36,19 +36,21 @@ class LeaningNumbers:
     steep: float = 45.0
     """Greatest angle [deg] of a side to the vertical."""
     facing: float = 0.6
-    """Least cosine between a side and the horizontal direction to the camera."""
+    """Least cosine between the normal of a side and the horizontal direction to the camera."""
     share: float = 0.15
     """Least share of an object's points on such a side."""
     even: float = 6.5
-    """Greatest median deviation [deg] of a flat or cylindrical side: round ones have more."""
+    """Greatest median deviation [deg] of a side's lean, if it is flat or cylindrical. Round sides
+    have more.
+    """
     fewest: int = 2
-    """Fewest objects with such a side: one may be tapered."""
+    """Least number of objects with such a side: one may be tapered."""
     alike: float = 6.5
-    """Greatest difference [deg] of a side from the median side."""
+    """Greatest difference [deg] of a side's lean from the median one, at which sides lean alike."""
     most: float = 0.66
     """Least share of the sides that are alike."""
     told: float = 12.0
-    """Least leaning [deg] for a note: cups taper by less."""
+    """Least median lean [deg] of the sides for a note: cups taper by less."""
     top: float = 0.98
     """Quantile of the points' heights that is the height of an object."""
 

@@ -26,36 +26,41 @@ class MaskNumbers:
     """Bounds by which given masks and labels of objects are read."""
 
     most_labels: int = 1000
-    """Most objects; an image of labels with more values is taken for a photograph, and refused."""
+    """Greatest number of objects. An image of labels with more values is taken for a photograph,
+    and refused.
+    """
     shown: int = 3
-    """Most names of images that an error shows."""
+    """Greatest number of names of images that an error shows."""
     least_share: float = 0.05
-    """A mask is refused if less than this share of its measured pixels is on objects above the
-    table.
+    """Least share of a mask's measured pixels on objects above the table. A mask with less is
+    refused.
     """
     own_share: float = 0.5
-    """A segmented object belongs to the target if at least this share of its pixels is in the mask.
+    """Least share of the pixels of a segmented object in the mask, at which the object belongs to
+    the target.
     """
     mask_share: float = 0.3
-    """A segmented object also belongs to the target if it fills this share of the mask above the
-    table.
+    """Least share of the mask above the table that a segmented object of the target fills. Such an
+    object belongs to the target, too.
     """
     low: float = 0.01
     """Height [m] above the support below which a pixel counts as lying on it."""
     rim: int = 4
     """Greatest error [pixels] of the border of a given mask."""
     whole: float = 0.5
-    """Least share of the image in a mask that is perhaps inverted."""
+    """Share of the image in a mask above which the mask is perhaps inverted."""
     told: float = 0.05
-    """Share of a mask's pixels whose removal is mentioned in a note; a smaller share is not."""
+    """Share of a mask's pixels above which their removal is mentioned in a note."""
     reach: float = 0.04
-    """Greatest shift of a mask that is looked for, as a share of the image's width. Colour and
+    """Greatest shift of a mask that is tried, as a share of the width of the image. Colour and
     depth that are not aligned differ by 2 % or so.
     """
     gained: float = 0.1
-    """Least share of a mask's pixels that a shift must bring back onto the object for a note."""
+    """Least share of a mask's pixels that a shift brings back onto the object, for a note."""
     fitting: float = 0.85
-    """Least share of the shifted mask's pixels on the object; else its shape is another one."""
+    """Least share of the shifted mask's pixels that are on the object, for a note. With less, the
+    mask has another shape.
+    """
 
 
 MASKS = MaskNumbers()

@@ -28,82 +28,93 @@ from torchgrasp.scene.table_image import TableImage
 
 @dataclasses.dataclass(frozen=True)
 class MergeNumbers:
-    """Bounds by which pieces of a segmented image are merged to objects; lengths are in metres."""
+    """Bounds by which pieces of a segmented image are merged to objects."""
 
     gap: float = 0.008
-    """Pieces touch where points are nearer than this."""
+    """Distance [m] between points of two pieces below which the pieces touch."""
     touching: int = 3
-    """Least number of such points; of fewer, the gap is not known."""
+    """Least number of points of a piece that are so near: with fewer, the gap is not known."""
     far: float = 0.05
-    """Greatest distance between parts of one object."""
+    """Greatest distance [m] between parts of one object."""
     spacing: float = 0.0015
-    """Distance of the points that are kept of a large piece."""
+    """Distance [m] between the points that are kept of a large piece."""
     dense: int = 3000
-    """Pieces of fewer pixels keep all their points."""
+    """Number of pixels of a piece below which it keeps all its points."""
     small: int = 30
-    """Pieces of fewer points are no bodies; they go to the nearest body."""
+    """Number of points of a piece below which it is no body, and goes to the nearest body."""
     points: int = 2000
-    """Most points that a body keeps; a larger one is thinned."""
+    """Greatest number of points, about, that a body keeps: a larger one is thinned."""
     reach: float = 0.02
-    """Pieces that meet at two ends are nearer than this: pixels at rims are missing."""
+    """Distance [m] below which two pieces may meet at two ends: pixels at rims are missing."""
     end_depth: float = 0.01
-    """Points up to this much farther than the nearest belong to an end."""
+    """Additional distance [m], beyond the least one between two pieces, up to which points belong
+    to an end.
+    """
     end_gap: float = 0.015
-    """Points of one end are nearer to each other than this."""
+    """Distance [m] between points below which they belong to one end."""
     end_points: int = 6
-    """Least points of an end."""
+    """Least number of points of an end."""
     low: float = 0.02
     """Quantile of the heights of a body's points that is its foot."""
     high: float = 0.98
     """Quantile of the heights of a body's points that is its top."""
     nested: float = 0.4
-    """A body with this share of its points over a larger one's footprint is a part of it."""
+    """Share of a body's points over a larger body's footprint above which the body is a part of it.
+    """
     beside: float = 0.3
-    """Bodies that stand side by side have a smaller share of their points over each other."""
+    """Share of the points of a body over another one, below which the two stand side by side."""
     standing: float = 0.015
-    """A body whose foot is lower than this stands on the table."""
+    """Height [m] of a body's foot below which the body stands on the table."""
     standing_share: float = 0.5
-    """A body whose foot is lower than this share of its top stands, too: its foot is hidden."""
+    """Height of a body's foot, over that of its top, below which it stands, too: its foot is
+    hidden.
+    """
     lesser: float = 0.1
-    """A body with fewer points, as a share of the other's, is a part of it, such as a knob."""
+    """Number of a body's points, over the other body's, up to which it is a part of that one. Such
+    a part is a knob.
+    """
     upon: float = 0.01
-    """The top of a body upon another is higher by this."""
+    """Least height [m] of the top of a body over that of another one on which it lies."""
     upon_foot: float = 0.5
-    """The foot of a body upon another is higher than this share of the other's top."""
+    """Least height of the foot of such a body, as a share of the other's top."""
     upon_share: float = 0.5
-    """Share of a body's points over the body that it lies upon."""
+    """Least share of such a body's points over the body on which it lies."""
     ring_width: float = 0.025
-    """A standing ring, seen from its edge, has a narrower footprint."""
+    """Greatest width [m] of the footprint of a standing ring that is seen from its edge."""
     ring_foot: float = 0.01
-    """The foot of both parts of such a ring is higher: none stands."""
+    """Least height [m] of the foot of both parts of such a ring, neither of which stands."""
     level: float = 0.005
-    """The tops of two parts of a rim differ by less."""
+    """Greatest difference [m] of the tops of two parts of one rim."""
     rim_gap: float = 0.4
-    """Largest gap in a rim, over the width of its footprint."""
+    """Greatest gap between two parts of a rim, as a share of the width of their footprint."""
     rim: float = 0.004
-    """Points no lower than this below the top belong to a rim."""
+    """Greatest depth [m] below the top of points that belong to a rim."""
     wall: float = 0.012
-    """Points farther than this inside the footprint are in a rim's middle."""
+    """Distance [m] from the outline of the footprint, inside of it, beyond which points are in a
+    rim's middle.
+    """
     hollow: float = 0.2
-    """Least share of high points in the middle of a body that is not hollow."""
+    """Share of high points in the middle from which on a body is not hollow."""
     handle: float = 0.7
-    """A floating body of a smaller size, over its neighbour's, may be a handle that is far off."""
+    """Size of a floating body, over its neighbour's, below which it may be a handle that is far
+    off.
+    """
     from_above: float = 0.2
     """Least length, in the image, of the unit vector that points down. In a view from above no
     piece has a lower edge.
     """
     below: int = 4
-    """Distance of the pixel that is below an edge [px]."""
+    """Distance [px] from an edge pixel of the pixel that is taken as below it."""
     seen: float = 0.7
-    """Share of the lower edge below which the table is seen, if a piece floats."""
+    """Least share of the lower edge of a floating piece below which the table is seen."""
     edge: float = 0.1
     """Quantile of the heights of the lower edge that counts as its height."""
     peak: float = 0.9
     """Quantile of the heights of a piece that counts as its top, for a floating piece."""
     floating: float = 0.006
-    """The lower edge of a floating piece is higher than this."""
+    """Height [m] of the lower edge of a piece above which it floats."""
     floating_share: float = 0.4
-    """The lower edge of a floating piece is higher than this share of its top."""
+    """Least height of the lower edge of a floating piece, as a share of the top of the piece."""
 
 
 MERGE = MergeNumbers()

@@ -29,23 +29,26 @@ from torchgrasp.scene.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class OccupancyNumbers:
-    """Parameters of the voxel map of the space around the target; lengths are in metres."""
+    """Parameters of the voxel map of the space around the target."""
 
     spacing: float = 0.005
-    """Spacing of the voxels: a third of a finger's width."""
+    """Spacing [m] of the voxels: a third of a finger's width."""
     sideways: float = 0.25
-    """Horizontal distance by which the voxels extend beyond the target's points."""
+    """Horizontal distance [m] by which the voxels extend beyond the target's points."""
     above: float = 0.04
-    """Height by which the voxels extend above the highest point over this area."""
+    """Height [m] by which the voxels extend above the highest point over this area."""
     noise: float = 0.004
-    """Space more than this in front of a measured depth is free: three deviations of the noise."""
+    """Distance [m] in front of a measured depth beyond which space is free: three deviations of the
+    noise.
+    """
     low: float = 0.01
-    """Unlabelled pixels lower than this above the table show the table."""
+    """Height [m] above the table below which unlabelled pixels show the table."""
     rim: int = 6
-    """Distance [px] in the image within which unlabelled pixels may be the target's: masks are off.
+    """Distance [px] from the target's pixels within which unlabelled pixels may be the target's:
+    masks are off.
     """
     rim_depth: float = 0.02
-    """Difference of depth within which such pixels are the target's."""
+    """Greatest difference of depth [m] of such pixels from the target."""
     flying: int = 20
     """Least number of connected unlabelled pixels of an object; fewer are flying pixels."""
     gap: int = 8
@@ -55,7 +58,7 @@ class OccupancyNumbers:
     last: float = 0.98
     """Quantile of an object's points at which its extent ends."""
     least: float = 0.002
-    """Least probability of a hidden place."""
+    """Least probability that a hidden voxel is occupied."""
 
 
 OCCUPANCY = OccupancyNumbers()

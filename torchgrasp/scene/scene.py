@@ -49,29 +49,37 @@ class SceneNumbers:
     """Bounds by which clicked pixels, points and parts of objects are found in a scene."""
 
     front: float = 0.01
-    """Points of a cloud farther behind their pixel's depth [m] belong to something hidden."""
+    """Distance [m] of a point behind its pixel's depth from which on it belongs to something
+    hidden.
+    """
     click: float = 3.0
     """Largest distance [px] of a clicked pixel from a measured one."""
     touch: float = 0.01
     """Largest distance [m] of a given point from a measured one."""
     part: float = 0.1
-    """Share of an object's pixels beyond a crease that may be another object."""
+    """Least share of an object's pixels beyond a crease that may be another object."""
     apart: float = 0.2
-    """Share of an object's pixels before or behind a jump that may be another object."""
+    """Least share of an object's pixels before or behind a jump of depth that may be another
+    object.
+    """
     across: float = 0.19
-    """Distance [m] of a target's two farthest points from which it may be several objects: hands
-    grasp few that are longer.
+    """Distance [m] between a target's two farthest points from which on it may be several objects.
+    Hands grasp few that are longer.
     """
     filled: float = 0.85
-    """Greatest share of the convex hull of its pixels that such a target fills."""
+    """Share of the convex hull of its pixels that such a target fills, below which it may be
+    several objects.
+    """
     closing: int = 2
-    """Pixels by which gaps in a target are closed before this share is measured."""
+    """Number of pixels by which gaps in a target are closed before this share is measured."""
     lowest: float = 0.02
     """Share of a target's points that may be lower than its foot: outliers."""
     drawn: int = 2000
-    """Most points of a target whose place on a support is judged."""
+    """Greatest number of points of a target whose place on a support is judged."""
     beside: float = 6.0
-    """Largest distance [px] of an object from the outline that it covers: rims have no label."""
+    """Greatest distance [px] of an object's pixels from the outline of a target that it covers:
+    rims have no label.
+    """
     before: float = 0.01
     """Least distance [m] of such an object in front of the target: objects beside it cover nothing.
     """

@@ -33,45 +33,49 @@ class SegmentNumbers:
     own: float = 0.6
     """Least height of a pixel itself, over the least mean height around it."""
     near: float = 0.005
-    """A pixel at a jump of depth joins an object within this distance [m]."""
+    """Distance [m] from an object within which a pixel at a jump of depth joins it."""
     near_pixels: float = 4.0
-    """A pixel of a given mask also joins one within this distance, in widths of a pixel. Pixels of
-    a small image lie farther apart.
+    """The same distance in widths of a pixel, if that is more, for a pixel of a given mask. Pixels
+    of a small image lie farther apart.
     """
     rounds: int = 12
-    """Most rounds in which objects grow into pixels at jumps."""
+    """Greatest number of rounds in which objects grow into pixels at jumps."""
     few: int = 6
     """Least number of pixels of a piece or hole that is not noise, in an image of any size."""
     overhang: float = 0.05
-    """An object extends this far [m] beyond the visible region of its support, at most."""
+    """Greatest distance [m] by which an object extends beyond the visible region of its support."""
     high: float = 0.005
-    """Height [m] from which a pixel counts as high; an uneven table has few such pixels."""
+    """Least height [m] of a pixel that counts as high; an uneven table has few such pixels."""
     high_deviations: float = 4.0
-    """A high pixel is also higher than this many deviations of the table's noise."""
+    """Least height of such a pixel in standard deviations of the table's noise, if that is more."""
     high_share: float = 0.1
     """Least share of high pixels among those of an object."""
     over: float = 0.2
     """Least share of an object's pixels over the visible region of its support."""
     vast: float = 0.2
-    """Largest root mean square distance [m] of an object's points from their middle: a wall's is
-    larger.
+    """Greatest root mean square distance [m] of an object's points from their middle: that of a
+    wall is larger.
     """
     floor: float = 0.001
-    """Least height of the inner floor of an object above the table [m]."""
+    """Height [m] above the table from which on a hole in an object is its inner floor."""
     speck: int = 100
-    """Objects with fewer pixels are left out."""
+    """Number of pixels of an object below which it is left out."""
     small: int = 500
-    """Objects with fewer pixels may be noise, or a fringe of a large object."""
+    """Number of pixels of an object below which it may be noise, or a fringe of a large object."""
     uneven: float = 8.0
-    """Height, in deviations of the table's noise, that pixels of a small object must exceed."""
+    """Height, in standard deviations of the table's noise, that pixels of a small object must
+    exceed.
+    """
     uneven_share: float = 0.25
     """Least share of a small object's pixels that exceed this height; else it is noise."""
     margin: int = 4
-    """Distance from a small object at which a large one is sought [px]."""
+    """Distance [px] from a small object within which a large one is sought, of which it may be a
+    fringe.
+    """
     fringe: float = 0.005
     """Largest half width of a fringe [m]."""
     larger: int = 10
-    """Least ratio of the number of pixels of an object to that of its fringe."""
+    """Least ratio of the number of pixels of a large object to that of its fringe."""
 
 
 SEGMENT = SegmentNumbers()

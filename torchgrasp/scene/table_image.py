@@ -18,15 +18,15 @@ class HeightNumbers:
     """Parameters of the image of heights above a table, and of the noise of these heights."""
 
     window: int = 5
-    """Side of the square over which heights are averaged [px]."""
+    """Side [px] of the square over which heights are averaged."""
     band: float = 0.010
-    """Mean heights below this [m], of either sign, measure the noise of the table."""
+    """Greatest absolute value [m] of mean heights that measure the noise of the table."""
     foot: float = 0.030
     """Greatest distance [m] from the table of a pixel whose height is averaged. The mean at an
     object's foot leaves out higher parts.
     """
     normal: float = 1.4826
-    """Standard deviation over the median of the absolute value, of a normal distribution."""
+    """Ratio of the standard deviation to the median absolute value of a normal distribution."""
     jump: float = 0.006
     """Least jump of depth between two surfaces [m], in addition to the change that a slope
     causes.
@@ -34,7 +34,7 @@ class HeightNumbers:
     slope: float = 2.0
     """Largest change of depth of one surface from pixel to pixel, over a pixel's width."""
     least_share: float = 1e-9
-    """Least share of averaged pixels, so that nothing is divided by 0."""
+    """Least share of averaged pixels that is a divisor, so that nothing is divided by 0."""
 
 
 HEIGHT = HeightNumbers()

@@ -38,7 +38,10 @@ from torchgrasp.shape.kernel import (
 from torchgrasp.shape.posterior import CHUNK
 
 Evaluate = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
-"""A function of normalised points (q, 3) and the index of each point's surface (q,)."""
+"""A function of normalised points (q, 3) and the index (q,) of each point's surface.
+
+It returns tensors whose first axis is q.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -297,8 +300,10 @@ class ShapeBatch(Value):
         return torch.stack([own, ~own], 1)
 
     def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
-        """Return (distance, gradient): the mean signed distance and its gradient at q normalised
-        points.
+        """Return (distance, gradient): the mean signed distance (q,) and its gradient (q, 3).
+
+        They are at q normalised points `x` (q, 3), equally many for each entry, entry by entry. The
+        distance is normalised; the gradient has no unit.
         """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
@@ -307,7 +312,12 @@ class ShapeBatch(Value):
         return self._evaluate(evaluate, x)  # pyright: ignore[reportReturnType]
 
     def mean_jet(self, x: Queries) -> MeanJet:
-        """Return the mean distance with first and second derivatives at q normalised points."""
+        """Return the mean signed distance with its first and second derivatives, at q points `x`
+        (q, 3).
+
+        The points and the results are normalised. There are equally many points of each entry,
+        entry by entry.
+        """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
             return evaluate_mean_jet(self.surfaces.weighted(wall), part)[0]
@@ -315,7 +325,11 @@ class ShapeBatch(Value):
         return MeanJet(*self._evaluate(evaluate, x))
 
     def variance(self, x: Queries) -> Float[Tensor, "q"]:
-        """Return the variance of the distance at q normalised points."""
+        """Return the variance (q,) of the signed distance at q normalised points `x` (q, 3).
+
+        It is in squared normalised units. There are equally many points of each entry, entry by
+        entry.
+        """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor]:
             of = self.surfaces.weighted(wall)
@@ -329,7 +343,12 @@ class ShapeBatch(Value):
         return self._evaluate(evaluate, x)[0]
 
     def jet(self, x: Queries) -> SurfaceJet:
-        """Return mean and variance of the distance, with derivatives, at q normalised points."""
+        """Return mean and variance of the signed distance, with derivatives, at q points `x` (q,
+        3).
+
+        The points and the results are normalised. There are equally many points of each entry,
+        entry by entry.
+        """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
             explain = partial(self.surfaces.explain, wall)

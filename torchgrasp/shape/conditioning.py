@@ -26,7 +26,11 @@ BELOW = 1.0 - 1e-9
 
 
 def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
-    """Return the posterior given observations, by one Cholesky factor of their covariance."""
+    """Return the Gaussian process (`Posterior`) of the signed distance, given observations and a
+    kernel.
+
+    It takes one Cholesky factor of the covariance of all observed numbers.
+    """
     observations = observations.with_normals_first()
     y, noise = observations.rows()
     near = int(observations.has_normal.sum())
@@ -98,10 +102,12 @@ def append_observations(
 
 @dataclasses.dataclass(frozen=True)
 class Selection(Value):
-    """The result of a choice of the most informative candidates."""
+    """The observations that were chosen among candidates as the most informative, and the posterior
+    with them.
+    """
 
     picks: Int[Tensor, "picks"]  # indices of the chosen candidates, in the order of their choice
-    posterior: Posterior  # given the known observations and the chosen ones
+    posterior: Posterior  # the Gaussian process given the known and the chosen observations
 
 
 def select_points(

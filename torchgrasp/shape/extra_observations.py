@@ -41,11 +41,12 @@ class OutsideNumbers:
     """Parameters of the observed points on a sphere around the object."""
 
     points: int = 20
+    """Number of points on the sphere (Sec. 3.1 of the paper)."""
     radius: float = 1.2
-    """Number of points, and normalised radius of their sphere (Sec. 3.1)."""
+    """Radius of the sphere, normalised."""
     noise: float = 0.3
-    """Normalised standard deviation of an observed distance. Distances are those of the nearest
-    surface point; they are too long where these points are sparse.
+    """Standard deviation of an observed distance of these points, normalised. The distance is that
+    of the nearest surface point, too long where these are sparse.
     """
 
 
@@ -59,14 +60,15 @@ class ObservationNumbers:
     """
 
     normal: float = 0.05
+    """Standard deviation of each component of a unit normal on the seen side."""
     rim_normal: float = 0.5
+    """Standard deviation of each component of a unit normal on the outline."""
     hidden_normal: float = 0.25
+    """Standard deviation of each component of a unit normal on the hidden side."""
     vessel_rim_normal: float = 0.5
-    """Standard deviations of unit normals on the seen side, on the outline, and on the hidden side.
-    The last is for the outline of a vessel.
-    """
+    """Standard deviation of each component of a unit normal on a vessel's outline."""
     rim: float = 0.002
-    """Standard deviation of a point of the outline [m]."""
+    """Standard deviation [m] of a point of the outline."""
     free: float = 0.003
     """Standard deviation [m] of a distance from a point in free space to the surface. The distance
     is only a lower bound.
@@ -81,29 +83,33 @@ class FreeNumbers:
     """Parameters of the points in free space at which the object's distance is bounded."""
 
     outline_error: float = 0.005
-    estimated_error: float = 0.010
-    """Distances [m] by which the object may reach beyond its outline, as a camera loses rims. The
-    first is for a given camera, the second for an estimated one.
+    """Distance [m] by which the object may reach beyond its outline for a given camera, as a camera
+    loses rims.
     """
+    estimated_error: float = 0.010
+    """The same distance [m] for a camera whose position is estimated."""
     radius: float = 1.15
-    """Ratio of the radius within which free space is probed to that of all points."""
+    """Ratio of the radius within which free space is observed to that of all points."""
     ground: int = 9
+    """Number of points along each side of a square grid below the table."""
     ground_side: float = 0.9
-    """Points along each side of a square below the table, and half its side, normalised."""
+    """Half the side of this square, normalised."""
     below: tuple[float, ...] = (0.003, 0.012)
-    """Depths [m] of these points below the table."""
+    """Depths [m] of the points of this grid below the table."""
     least: float = 0.001
-    """Least distance [m] that is a constraint."""
+    """Least distance [m] from the surface that is used as a bound."""
     beside: tuple[float, ...] = (0.008, 0.016)
     """Distances [m] of camera rays from the outline."""
     rays: int = 32
-    """Number of rays at each distance."""
+    """Number of camera rays at each of these distances."""
     depths: int = 13
     """Number of points along each ray, over the object's depth."""
     violation: float = 0.002
-    """Depth [m] inside the shape from which a point violates free space."""
+    """Depth [m] of a point of free space inside the shape from which on the point violates free
+    space.
+    """
     violations: int = 16
-    """Most such points that are added at once."""
+    """Greatest number of such points that are observed in addition, in one round."""
 
 
 FREE = FreeNumbers()
@@ -114,12 +120,14 @@ class MiddleNumbers:
     """Parameters of the observed points in the middle of a vessel's wall and above its rim."""
 
     points: int = 150
-    """Most points in the middle of the wall."""
+    """Greatest number of points in the middle of a vessel's wall."""
     side: float = 0.8
-    """Greatest vertical part of the unit normals of a side: a floor may be thicker than known."""
+    """Greatest vertical part of the unit normals of a vessel's sides: a floor may be thicker than
+    known.
+    """
     over: float = 0.5
-    """Height of a point above the rim, in radii of the mouth. The inner surface has no lid, so it
-    surrounds free space there, too.
+    """Height of an observed point above the vessel's rim, in radii of its mouth. The inner surface
+    has no lid, so it surrounds free space there, too.
     """
 
 
@@ -150,25 +158,32 @@ exact then.
 """
 # observations of n points, and the correlated errors (n, c) of their distances, normalised
 Part = tuple[Observations, Tensor | None]
+"""Observations of m points, and the normalised errors (m, c) that they share: a column for each of c
+causes. None means no shared errors.
+"""
 FreeSpace = tuple[Points, Float[Tensor, "n"]]
 """Points (n, 3) in free space, and the least signed distances (n,) there, both normalised."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ExtraObservations(Value):
-    """The normalised frame of a surface, and the observations in addition to the points of the
-    cloud.
+    """What the Gaussian process of a surface observes in addition to the points of the cloud, in a
+    normalised frame.
     """
 
-    frame: Normalisation
+    frame: Normalisation  # the normalised frame of the surface
     # observed distances at points inside and outside the object, without normals
     anchors: Observations
     normal_noise: float  # standard deviation of the components of the cloud's unit normals
     # ratio of the surface's true deviations to the posterior's standard deviations
     std_factor: float = 1.0
-    parts: tuple[Part, ...] = ()  # observed points of the outline and of the hidden side
-    free: FreeSpace | None = None  # points in free space, or None if they are not used
-    rows: Bool[Tensor, "rows"] | None = None  # mask of cloud points on this surface; None: all
+    # observations of the outline and of the hidden side, each with the errors (m, c) that its
+    # points share, one column for each cause; None: no shared errors
+    parts: tuple[Part, ...] = ()
+    # points in free space, with lower bounds of their signed distances; None if they are not used
+    free: FreeSpace | None = None
+    # mask of the points of the cloud that are on this surface; None means all
+    rows: Bool[Tensor, "rows"] | None = None
     kind: Kind = "guess"  # how the hidden side was completed, such as "mirrored"
 
 
@@ -290,10 +305,10 @@ def observe(
 
 @dataclasses.dataclass(frozen=True)
 class Middle(Value):
-    """Points in the middle of a vessel's wall, and the thickness of the wall."""
+    """Points in the middle of the wall of an open vessel, and the wall's thickness."""
 
-    x: Points  # points (n, 3), normalised
-    side: Bool[Tensor, "n"]  # mask of the points in the sides, not in the floor
+    x: Points  # points (n, 3) in the middle of the wall, normalised
+    side: Bool[Tensor, "n"]  # mask of the points in the vessel's sides, not in its floor
     thickness: float  # thickness of the wall, normalised
 
 

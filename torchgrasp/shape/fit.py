@@ -61,16 +61,19 @@ class ShapeNumbers:
     """Parameters of the fit of a shape, a Gaussian process, to a cloud."""
 
     budget: int = 1000
-    """Greatest number of observed points; the Cholesky factor of their covariance then has 4000
+    """Greatest number of observed points. The Cholesky factor of their covariance then has 4000
     rows.
     """
     camera: int = 85
+    """Number of observed points by default, with the support "camera"."""
     paper: int = 70
-    """Default numbers of observed points, with the support "camera" and "paper"."""
+    """Number of observed points by default, with the support "paper"."""
     rounds: int = 3
-    """Most rounds in which free space that the shape violates is observed."""
+    """Greatest number of rounds in which free space that the shape violates is observed."""
     gap: float = 0.025
-    """Least width [m] of a gap that misleads a fingertip; that of a handle is narrower."""
+    """Least width [m] of a gap of the outline that misleads a fingertip; that of a handle is
+    narrower.
+    """
 
 
 SHAPE = ShapeNumbers()

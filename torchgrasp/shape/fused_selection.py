@@ -17,13 +17,19 @@ from torchgrasp.shape.posterior import Posterior
 def choose_points(
     start: Posterior, candidates: Observations, budget: int, criterion: str, stop: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (picks, L, L^-1 y): the most informative candidates, with the grown Cholesky factor.
+    """Choose the most informative of some observations (active learning), for a thin plate kernel.
 
-    `picks` are the indices of at most `budget` candidates, in the order of their choice. `start` is
-    the posterior given the known observations, whose Cholesky factor grows to L by four rows for
-    each pick. y are the observed numbers: those of `start`, then those of each pick. A pick has the
-    greatest "variance" or "error", or "both" (`criterion`). The choice ends when no variance
-    exceeds `stop`.
+    Return (picks, L, L^-1 y). `picks` are the indices of the chosen candidates, in the order of
+    their choice. L is the Cholesky factor of the covariance of all observed numbers y. These are
+    the numbers of `start`, then the distance and normal of each pick.
+
+    Args:
+        start: the posterior given the known observations.
+        candidates: the observations to choose from.
+        budget: greatest number of picks.
+        criterion: what a pick has most of: "variance" of the distance, "error" of the predicted
+            distance, or "both".
+        stop: variance, in squared normalised units; the choice ends when none exceeds it.
     """
     x = candidates.x
     n = len(x)

@@ -41,9 +41,10 @@ class DomainNumbers:
     reach: float = 1.25
     """Ratio of the domain's radius to that of the observations: far away nothing is known."""
     joint: int = 1000
-    """Most points of one joint posterior: its memory grows with the square of their number."""
+    """Greatest number of points of one joint posterior: its memory grows with their square."""
     compared: int = 300
-    """Most points at which errors of poses are compared with the shape's deviations."""
+    """Greatest number of points at which errors of poses are compared with the shape's deviations.
+    """
 
 
 DOMAIN = DomainNumbers()

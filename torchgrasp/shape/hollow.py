@@ -32,12 +32,14 @@ Found = TypeVar("Found")
 
 @dataclasses.dataclass(frozen=True)
 class TieNumbers:
-    """Parameters of the observations that give a vessel's wall its known thickness."""
+    """Parameters of the observations that give the wall of an open vessel its known thickness."""
 
     rounds: int = 3
-    """Most rounds; each observes the points with the greatest error of the thickness."""
+    """Greatest number of rounds. Each observes the points with the greatest error of the wall's
+    thickness.
+    """
     points: int = 24
-    """Most points of a round."""
+    """Greatest number of points that are observed in a round."""
     off: float = 0.0005
     """Greatest error [m] of the wall's thickness that is not corrected."""
     noise: float = 0.0007

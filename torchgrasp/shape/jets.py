@@ -18,28 +18,35 @@ from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries, separations
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Weighted:
-    """The observed points and weights that determine a posterior mean, and the kernel.
+    """What determines the posterior mean of a surface's signed distance: observed points, their
+    weights, and the kernel.
 
-    The first `near` of n points have normals. With a leading axis q each of q query points has a
-    posterior of its own.
+    The mean at a point is a weighted sum of the kernel's values and slopes at the n observed
+    points. The first `near` of these have observed normals. With a leading axis q, each of q query
+    points has a posterior of its own.
     """
 
     x: Float[Tensor, "*q n 3"]  # observed points, normalised, those with normals first
-    a: Float[Tensor, "*q n"]  # weight of each distance
-    b: Float[Tensor, "*q near 3"]  # weight of each normal
-    kernel: Kernel
+    a: Float[Tensor, "*q n"]  # weight of each point's observed distance
+    b: Float[Tensor, "*q near 3"]  # weight of each component of a point's observed normal
+    kernel: Kernel  # covariance of the signed distances at two points
 
     @cached_property
     def arrays(self) -> Any:
-        """These points and weights as arrays for compiled loops, if all query points have one
-        posterior.
+        """The NumPy arrays (points, a, b, psi) that the compiled loops take, computed once.
+
+        They are the observed points (3, n), and the weights (1, n) of distances and (1, 3, n) of
+        normals. The weights of points without normals are 0. The number psi is the kernel's length,
+        normalised. Ask for them only if all query points share one posterior with a thin plate
+        kernel.
         """
         from torchgrasp.shape import fused_jets  # it imports numba
 
         return fused_jets.arrays_of(self, self.a[None], self.b.mT[None])
 
 
-# `Posterior.explain`, for the points of a chunk
+# `Posterior.explain`: function of covariances (q, r) with all observed numbers, which returns (the
+# variance (q,) that these explain, the covariances times the inverse covariance)
 Explain = Callable[[Tensor], tuple[Tensor, Tensor]]
 Values = Float[Tensor, "q n"]
 Kernels = tuple[list[Tensor], Values, Values, Float[Tensor, "q near"]]

@@ -40,8 +40,8 @@ class ProfileNumbers:
     near_zero: float = 1e-4
     """Normalised distance r below which k(r) is replaced by its Taylor polynomial of degree 4."""
     power: float = 1.5
-    """Points coincide if r^2 is at most this power of the rounding error. Otherwise rounding of the
-    third derivative would dominate.
+    """Power of the rounding error: two points coincide if their r^2 is at most this power.
+    Otherwise rounding of the third derivative would dominate.
     """
 
 

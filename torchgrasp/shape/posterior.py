@@ -40,17 +40,19 @@ class ChunkNumbers:
     """
 
     mean: int = 2048
+    """Number of points of a chunk for the mean."""
     gradient: int = 512
+    """Number of points of a chunk for the mean's gradient."""
     jet: int = 256
-    """Points of a chunk for the mean, for its gradient, and for an estimate or a jet."""
+    """Number of points of a chunk for an estimate, or for a jet (the mean with two derivatives)."""
     memory: int = 2**27
-    """Memory [B] of the temporaries of an estimate on an accelerator."""
+    """Greatest memory [B] of an estimate's temporaries on an accelerator."""
     entry: int = 32
-    """Memory [B] of a column of the covariance of distance and gradient."""
+    """Memory [B] for each column of the covariance of distance and gradient."""
     least: int = 64
-    """Least points of a chunk on an accelerator."""
+    """Least number of points of a chunk on an accelerator."""
     tile: int = 24
-    """Number of columns; matrix products are fastest with a multiple of it."""
+    """Number of which the number of columns is a multiple, as matrix products are then fastest."""
 
 
 CHUNK = ChunkNumbers()

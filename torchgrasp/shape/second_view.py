@@ -25,22 +25,24 @@ from torchgrasp.values.planning import Grasps
 
 @dataclasses.dataclass(frozen=True)
 class SecondViewNumbers:
-    """The cameras that are compared, and what each of them sees."""
+    """Parameters of the search for a second view: the cameras that are compared, and what each
+    sees.
+    """
 
     azimuths: int = 24
-    """Directions around the object."""
+    """Number of directions around the object in which cameras are compared."""
     elevations: tuple[float, ...] = (15.0, 30.0, 45.0, 60.0, 75.0)
-    """Angles [deg] above the horizontal; without a table, also below."""
+    """Elevations [deg] of these cameras above the horizontal; without a table, also below."""
     far: float = 0.5
-    """Distance [m] of a camera, if that of the first view is unknown."""
+    """Distance [m] of a camera from the object, if that of the first view is unknown."""
     near: float = 1.5
-    """Least distance of a camera, in radii of the shape's domain."""
+    """Least distance of a camera from the object, in radii of the shape's domain."""
     resolution: int = 32
-    """Cells along the domain's diameter when the surface is extracted."""
+    """Number of cells along the domain's diameter when the surface is extracted."""
     points: int = 250
-    """Points of the surface that a camera may see."""
+    """Number of points of the surface that a camera may see."""
     grasps: int = 20
-    """Best grasps whose contacts count: as many as judge a set of fingers."""
+    """Number of best grasps whose contacts count: as many as judge a set of fingers."""
     least_cosine: float = 0.3
     """Least cosine between ray and normal: real cameras lose surface at grazing angles."""
     spacing: float = 0.004
@@ -48,15 +50,19 @@ class SecondViewNumbers:
     margin: float = 0.01
     """Distance [m] to which the field reaches around the surface."""
     blocked: float = 0.25
-    """A ray is blocked nearer to the surface than this share of the spacing."""
+    """Distance of a ray from the surface, over the spacing of the field, below which the ray is
+    blocked.
+    """
     steps: int = 24
-    """Most steps along a ray, each as long as the distance from the surface."""
+    """Greatest number of steps along a ray, each as long as the distance from the surface."""
     noise: float = 0.01
-    """Deviation of a seen point, normalised: the noise that `fit_shape` assumes."""
+    """Standard deviation of a seen point, normalised: the noise that `fit_shape` assumes."""
     unseen: float = 1e3
-    """Deviation, normalised, that stands for a point that was not seen."""
+    """Standard deviation, normalised, that stands for a point that was not seen."""
     tie: float = 1e-6
-    """Share by which expected deviations of equal views may differ: far above rounding."""
+    """Relative difference of the expected deviations up to which two views are equal: far above
+    rounding.
+    """
 
 
 VIEW = SecondViewNumbers()

@@ -36,9 +36,9 @@ class SurfaceNumbers:
     """Parameters of the extraction of a shape's surface as a mesh."""
 
     resolution: int = 48
-    """Cells along the domain's diameter."""
+    """Number of cells of the grid along the diameter of the shape's domain."""
     coarse: int = 4
-    """Side [cells] of the first blocks of the grid."""
+    """Number of cells along a side of the first blocks of the grid."""
     steeper: float = 1.3
     """Greatest assumed ratio of the mean's slope within a block to the slope between its corners.
     Blocks that the zero level cannot reach are not refined.
@@ -46,13 +46,14 @@ class SurfaceNumbers:
     rounding: float = 1e-12
     """Share of the domain's radius by which nodes may be outside the domain."""
     steps: int = 3
-    """Most Newton steps of a vertex."""
+    """Greatest number of Newton steps that move a vertex onto the surface."""
     least_slope: float = 1e-12
-    """Least squared slope of a step (no unit), which bounds a divisor."""
+    """Least squared slope of the mean (no unit) that is a divisor."""
     settled: float = 1e-4
     """Normalised motion below which a vertex is on the surface."""
     share: float = 0.02
-    """Least share of the cloud that is nearest to a piece of the zero level that is kept."""
+    """Least share of the cloud's points that are nearest to a piece of the zero level that is kept.
+    """
 
 
 SURFACE = SurfaceNumbers()
@@ -60,13 +61,14 @@ SURFACE = SurfaceNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class NodeNumbers:
-    """Lengths [m] that set the grid of the distance field for collision checks."""
+    """Lengths that set the grid of the distance field for collision checks."""
 
     thick: float = 0.04
-    """Least side of a thick body, which is not hollow."""
+    """Least side [m] of a thick body, which is not hollow."""
     wide: float = 0.004
+    """Spacing [m] of the nodes for thick bodies."""
     close: float = 0.003
-    """Spacing of the nodes for thick bodies, and for others."""
+    """Spacing [m] of the nodes for other bodies."""
 
 
 NODES = NodeNumbers()
@@ -140,8 +142,9 @@ def extract_surface(
 class Mesh(Value):
     """A triangle mesh of the estimated surface, without normals and deviations."""
 
-    vertices: Float[Tensor, "v 3"]  # corners of the triangles [m]
-    faces: Int[Tensor, "f 3"]  # indices of three vertices; normals point outward
+    vertices: Float[Tensor, "v 3"]  # corners (v, 3) [m] of the triangles, in the frame of the cloud
+    # indices (f, 3) of the vertices of each triangle; the normals point outward
+    faces: Int[Tensor, "f 3"]
 
 
 def extract_mesh(shape: ShapeGP) -> Mesh:

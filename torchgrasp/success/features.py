@@ -66,13 +66,13 @@ class FeatureNumbers:
     slippery: float = 0.5
     """Factor on the friction coefficient, for the features of a slippery object."""
     pull: float = 10.0
-    """Acceleration [m/s2] of a pull."""
+    """Acceleration [m/s2] that a pull gives the object, for the features of pulls."""
     least_force: float = 1e-3
     """Lower bound [N] of forces, so that their logarithms are finite."""
     most_force: float = 1e3
     """Upper bound [N] of forces; it also stands for a load that no force can carry."""
     most_spare: float = 2.0
-    """Upper bound of the absolute value of a force to spare, in means. It is the logarithm of a
+    """Greatest absolute value of a force to spare in a mean. A force to spare is the logarithm of a
     ratio of forces.
     """
 

@@ -22,19 +22,19 @@ class LoadNumbers:
     """Parameters of the forces that carry a load: friction cones, and bounds of forces."""
 
     carrying: float = 2.07
-    """Decrease of a lift's log-odds of success if the force that carries the load grows by a factor
-    e.
+    """Decrease of a lift's log-odds of success, if the force that carries the load grows by the
+    factor e.
     """
     torsion: float = 0.01
-    """Length [m] that is added to the height of the contacts' triangle, for the torsional friction
-    of a contact.
+    """Length [m] that is added to the height of the contacts' triangle. It stands for the torsional
+    friction of a contact.
     """
     edges: int = 32
     """Number of edges of the pyramid that approximates a friction cone."""
     least_force: float = 0.3
-    """Lower bound [N] of forces in the log-odds."""
+    """Lower bound [N] of the forces from which the log-odds are computed."""
     most_force: float = 100.0
-    """Upper bound [N] of forces in the log-odds."""
+    """Upper bound [N] of the forces from which the log-odds are computed."""
 
 
 LOADS = LoadNumbers()

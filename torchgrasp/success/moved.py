@@ -20,14 +20,15 @@ Sets = Float[Tensor, "d g f 3"]
 
 @dataclasses.dataclass(frozen=True)
 class MovedNumbers:
-    """Parameters of the object's displacements, and of the search for contacts of the displaced
-    object.
+    """Parameters of the displacements of an object, and of the search for the contacts of a
+    displaced object.
     """
 
     count: int = 16
-    """Number of displacements."""
+    """Number of displacements of the object that are compared."""
     radius: float = 0.02
-    """The greatest displacement [m], at which the fingers of a closing hand still reach the object.
+    """Length [m] of the greatest displacement, at which the fingers of a closing hand still reach
+    the object.
     """
     turn: float = 0.618
     """Step (no unit) of the sequence from which the sizes of the displacements are taken: the
@@ -40,11 +41,13 @@ class MovedNumbers:
     length: float = 0.12
     """Longest path [m] of a fingertip in the search for its contact."""
     steps: int = 24
-    """Largest number of steps of this search."""
+    """Greatest number of steps of a fingertip in this search."""
     still: float = 1e-6
     """Length [m] of a fingertip's path below which it has no direction."""
     flat: float = 1e-9
-    """Length of the gradient of the signed distance (no unit) below which it has no direction."""
+    """Length (no unit) of the gradient of the signed distance below which the gradient has no
+    direction.
+    """
 
 
 MOVED = MovedNumbers()

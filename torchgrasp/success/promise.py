@@ -26,15 +26,11 @@ BOUNDS = 200  # bounds of the log-odds that are tried, at equal steps
 
 
 class Promise(NamedTuple):
-    """A promise, supported by trials, of the share of returned grasps that hold.
+    """The rule by which a promised share of the returned grasps holds, as trials support it."""
 
-    `least` is the least predicted log-odds of success of a returned grasp. `trials` and `families`
-    are the numbers of trials, and of families of bodies in them, that determined this bound.
-    """
-
-    least: float
-    trials: int
-    families: int
+    least: float  # least predicted log-odds of success of a returned grasp
+    trials: int  # number of trials from which this bound was determined
+    families: int  # number of families of bodies in these trials
 
 
 @functools.cache

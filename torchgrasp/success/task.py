@@ -199,14 +199,14 @@ class TaskNumbers:
     """Loads of the named tasks, and the directions of pushes."""
 
     push: float = 2.5
-    """Force [N] of a push."""
+    """Force [N] of each push in the named tasks."""
     around: float = 1.24
-    """Length (no unit) of vectors along the diagonals and axes of a cube, 14 directions. Their
-    convex hull contains the unit ball.
+    """Length (no unit) of vectors along the 14 diagonals and axes of a cube. Their convex hull
+    contains the unit ball.
     """
     upward: float = 1.2
-    """Vectors among these with at least this z component count as straight up; "pour" leaves them
-    out.
+    """Component along z of such a vector from which on it counts as straight up. The task "pour"
+    leaves these out.
     """
 
 

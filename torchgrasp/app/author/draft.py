@@ -61,23 +61,28 @@ class DraftNumbers:
     """Numbers of the random postures from which pads are guessed, and of the drives of a draft."""
 
     postures: int = 20_000  # number of random postures
-    chunk: int = 1000  # postures whose poses are computed at once, to bound the memory
+    # number of postures whose poses are computed at once, which bounds the memory
+    chunk: int = 1000
     rotor: float = 1e-3  # inertia [kg m2] that simulations add to each joint
-    stiffness: float = 4.0  # stiffness of a drive [1/rad], over the effort of the weakest joint
+    # stiffness of a drive [N m/rad] for each N m of effort of the weakest joint
+    stiffness: float = 4.0
     most_stiffness: float = 10.0  # greatest stiffness of a drive [N m/rad]
-    # the same of a hand whose joints all slide: the whole effort moves a fingertip by 10 mm
-    slide_stiffness: float = 100.0  # [1/m], over the effort of the weakest joint
-    most_slide_stiffness: float = 1e4  # [N/m]
-    damping: float = 0.03  # least time constant [s]: the ratio of damping to stiffness
-    trials: int = 1000  # random postures of each set of fingers in which a free one is sought
-    # If fewer than this share of postures is free of self-collision, pairs of links that collide
-    # often are no longer tested. Their shapes are too coarse: real fingers seldom meet.
+    # stiffness of a drive [N/m] for each N of effort of the weakest joint, if all joints slide; the
+    # whole effort then moves a fingertip by 10 mm
+    slide_stiffness: float = 100.0
+    most_slide_stiffness: float = 1e4  # greatest stiffness of a drive [N/m], if all joints slide
+    damping: float = 0.03  # least ratio of damping to stiffness of a drive: its time constant [s]
+    # number of random postures of each set of fingers in which one without collision is sought
+    trials: int = 1000
+    # Share of postures without self-collision below which pairs of links that collide often are no
+    # longer tested. Their shapes are too coarse: real fingers seldom meet.
     least_free: float = 0.02
-    # least share of postures in which such a pair collides
-    most_within: float = 0.25  # of links of one finger
-    most_between: float = 0.5  # of other links
-    listed: int = 5  # most pairs that a warning names
-    thin: float = 6e-3  # a fingertip thinner than this [m] may be no fingertip
+    # least share of postures in which such a pair of links of one finger collides
+    most_within: float = 0.25
+    # least share of postures in which such a pair of other links collides
+    most_between: float = 0.5
+    listed: int = 5  # greatest number of pairs of links that a warning names
+    thin: float = 6e-3  # thickness [m] of a link below which it may be no fingertip
 
 
 DRAFT = DraftNumbers()

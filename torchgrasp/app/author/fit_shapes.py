@@ -33,27 +33,33 @@ class FitNumbers:
 
     points: int = 4000  # number of points on each shape
     seed: int = 0  # random seed of these points
-    fineness: int = 3  # subdivisions of an icosahedron that samples a sphere
-    sections: int = 48  # sides of a sampled cylinder
-    # least value of a mesh's largest coordinate [m]; below it the mesh is in a wrong unit
+    # number of subdivisions of an icosahedron, whose corners then sample a sphere
+    fineness: int = 3
+    sections: int = 48  # number of sides of a sampled cylinder
+    # least absolute value of the largest coordinate [m] of a mesh; below it the unit is wrong
     least_reach: float = 5e-4
-    # A box of a link or of a fingertip is cut in two if this saves enough volume. The number is a
-    # share of the volume of all boxes; smaller gives more boxes.
-    saving: float = 0.12  # share for a box of a link
-    saving_tip: float = 0.04  # share for a box of a fingertip
-    short_boxes: int = 3  # most boxes of a short body
-    long_boxes: int = 8  # most boxes of a long body
-    tip_boxes: int = 4  # most boxes of a long tip, behind its ball
+    # least volume that cutting a link's box in two saves, as a share of the volume of all boxes; a
+    # smaller share gives more boxes
+    saving: float = 0.12
+    saving_tip: float = 0.04  # the same least share for cutting a fingertip's box in two
+    short_boxes: int = 3  # greatest number of boxes of a short body
+    long_boxes: int = 8  # greatest number of boxes of a long body
+    tip_boxes: int = 4  # greatest number of boxes of a long tip, behind its ball
     long: float = 0.08  # least length of a long body [m]
     long_tip: float = 2.6  # least length of a long tip, in radii of its ball
-    places: int = 12  # positions along an axis, with both ends; cuts are tried between the ends
+    # number of positions along an axis of a box, with both ends; cuts are tried between the ends
+    places: int = 12
     thinnest: float = 0.008  # least thickness of a part [m]
-    fewest: int = 20  # each part of a cut has more points: the size of fewer is chance
-    round_share: float = 0.9  # a cylinder replaces boxes with less than this share of their volume
-    turned_share: float = 0.85  # the same for a box that is turned out of the link's axes
-    flat: float = 1e-7  # root mean square thickness [m] of a flat body, which has no hull
+    # number of points that each part of a cut must exceed: the size of fewer is chance
+    fewest: int = 20
+    # greatest volume of a cylinder that replaces boxes, as a share of their volume
+    round_share: float = 0.9
+    # greatest volume of a box, turned out of the link's axes, that replaces boxes, as a share of
+    # their volume
+    turned_share: float = 0.85
+    flat: float = 1e-7  # root mean square thickness [m] below which a body is flat, and has no hull
     least_size: float = 1e-4  # least side of a shape [m], so that none is empty
-    digits: int = 6  # decimals to which all numbers are rounded
+    digits: int = 6  # number of decimals to which all numbers are rounded
 
 
 FIT = FitNumbers()

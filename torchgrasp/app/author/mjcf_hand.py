@@ -21,7 +21,10 @@ TIP = "tip"  # in the name of a site at a fingertip
 
 @dataclasses.dataclass(frozen=True)
 class Drive:
-    """Limits [rad or m] and effort [N m or N] of a joint. The effort is 0 if the file has none."""
+    """Limits `lower` and `upper` [rad or m] and greatest `effort` [N m or N] of a joint.
+
+    The effort is 0 if the file has none.
+    """
 
     lower: float
     upper: float

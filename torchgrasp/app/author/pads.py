@@ -27,30 +27,34 @@ from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf, pose_of
 class PadNumbers:
     """Numbers by which pads are guessed from the motion and the surface of tips."""
 
-    # share of the random postures, those with the nearest tips, in which fingers meet
+    # share of the random postures in which fingers count as meeting: those with the nearest tips
     near_share: float = 0.1
-    # A joint bends to one side if the middle of its range is farther than this from zero. The
-    # number is a share of the range.
+    # distance of the middle of the range of a joint from zero, as a share of the range, beyond
+    # which the joint bends to one side
     one_sided: float = 0.1
     # angle [rad] by which the contact of a round tip is turned from its motion to the finger's end
     tilt: float = math.radians(30)
     short_arm: float = 1e-3  # least distance of a tip from the axis of a joint that moves it [m]
-    beside: float = 0.003  # greatest distance [m] of surface points from a ray or a plane
+    # greatest distance [m] of surface points that count as on a ray or a plane
+    beside: float = 0.003
     end: float = 0.015  # length of a finger's end, half of whose thickness is the ball's radius [m]
     radii: tuple[float, float] = (0.003, 0.013)  # least and greatest radius of a ball [m]
-    radius_digits: int = 4  # decimals of the radius of a ball [m]
-    place_digits: int = 6  # decimals of the centre of a ball [m]
-    digits: int = 12  # decimals to which all numbers of a pad are rounded
+    radius_digits: int = 4  # number of decimals to which the radius [m] of a ball is rounded
+    place_digits: int = 6  # number of decimals to which the centre [m] of a ball is rounded
+    digits: int = 12  # number of decimals to which all numbers of a pad are rounded
 
 
 @dataclasses.dataclass(frozen=True)
 class FacingNumbers:
     """Bounds within which the pads of fingers count as facing each other."""
 
-    angle: float = 45.0  # most between a pad's normal and the way to the middle [degrees]
-    nearest: float = 0.015  # least distance of a contact from the middle [m]
-    farthest: float = 0.08  # greatest distance of a contact from the middle [m]
-    least: float = 1e-9  # least divisor [m], so that nothing is divided by 0
+    # greatest angle [degrees] between a pad's normal and the direction to the centroid of the
+    # contacts
+    angle: float = 45.0
+    nearest: float = 0.015  # least distance of a contact from this centroid [m]
+    farthest: float = 0.08  # greatest distance of a contact from this centroid [m]
+    # least distance [m] that is used as a divisor, so that nothing is divided by 0
+    least: float = 1e-9
 
 
 PADS = PadNumbers()

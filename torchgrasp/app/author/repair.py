@@ -18,25 +18,31 @@ from torchgrasp.hand.urdf import Joint, Link, Mimic, Triple, Urdf, pose_of
 class RepairNumbers:
     """Numbers that a URDF gets where it lacks them, and bounds of what is possible."""
 
-    # drive of a joint for which the URDF declares none, typical of small hands
-    effort: float = 1.0  # greatest torque [N m]
-    velocity: float = 3.0  # greatest speed [rad/s]
-    # the same of a sliding joint, which presses as that torque does at a finger of 0.1 m
-    force: float = 10.0  # greatest force [N]
-    speed: float = 0.1  # greatest speed [m/s], of grippers
-    most_wrist: int = 3  # joints that move all fingertips: more are an arm
-    # a link without shapes is a frame up to this mass [kg]: exporters write 1e-9 where one is needed
+    # greatest torque [N m] of a turning joint whose drive the URDF does not declare, typical of
+    # small hands
+    effort: float = 1.0
+    velocity: float = 3.0  # greatest speed [rad/s] of such a joint
+    # greatest force [N] of a sliding joint whose drive the URDF does not declare. It presses as
+    # that torque does at a finger of 0.1 m.
+    force: float = 10.0
+    speed: float = 0.1  # greatest speed [m/s] of such a sliding joint, as of grippers
+    most_wrist: int = 3  # greatest number of joints that move all fingertips: more are an arm
+    # mass [kg] up to which a link without shapes is only a frame: exporters write 1e-9 where a mass
+    # is needed
     frame: float = 1e-5
-    marker: float = 6e-3  # a fixed end link is a marker if smaller [m]: no fingertip is so small
-    # least mass and edge of a body without mass, so that simulators remain stable
-    least_mass: float = 1e-3  # least mass [kg]
-    least_size: float = 5e-3  # least edge [m]
-    # density [kg/m3] of a bounding box, of which half is filled with 1000 kg/m3
+    # size [m] below which a fixed end link is a marker: no fingertip is so small
+    marker: float = 6e-3
+    # least mass [kg] given to a body without mass, so that simulators remain stable
+    least_mass: float = 1e-3
+    least_size: float = 5e-3  # least edge [m] of the box of such a body, for the same reason
+    # density [kg/m3] of the bounding box of a body without mass: half of it is filled with 1000
+    # kg/m3
     density: float = 500.0
-    # farthest mass centre and radius of gyration, in half diagonals of the bounding box
+    # greatest distance of the mass centre, and greatest radius of gyration, in half diagonals of
+    # the bounding box
     far_out: float = 2.0
     rounding: float = 1e-6  # relative error of inertias, which URDFs write with few digits
-    digits: int = 15  # decimals of an angle [rad], so that short numbers remain short
+    digits: int = 15  # number of decimals of an angle [rad], so that short numbers remain short
 
 
 REPAIRS = RepairNumbers()

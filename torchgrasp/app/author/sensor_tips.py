@@ -24,8 +24,9 @@ from torchgrasp.hand.urdf import LinkShape, Urdf
 class SensorNumbers:
     """Bounds of a sensor tip."""
 
-    most_offset: float = 0.1  # farthest that a sensor reaches beyond the maker's tip [m]
-    sides: int = 16  # sides of a sensor that is drawn
+    # greatest distance [m] by which a sensor reaches beyond the maker's tip
+    most_offset: float = 0.1
+    sides: int = 16  # number of sides of the cylinder that is drawn for a sensor
 
 
 SENSOR = SensorNumbers()

@@ -21,10 +21,11 @@ from torchgrasp.hand.urdf import Mimic
 class TendonNumbers:
     """Numbers of the linear algebra of coupled joints."""
 
-    rank: float = 1e-9  # singular values below this share of the largest count as zero
-    leads: float = 0.1  # a leader's motion is at least this share of the largest one's
-    digits: int = 12  # decimals to which ratios and offsets are rounded
-    zero: float = 1e-9  # ratios below this are zero
+    # singular value, as a share of the largest one, below which it counts as zero
+    rank: float = 1e-9
+    leads: float = 0.1  # least motion of a leading joint, as a share of the largest joint's motion
+    digits: int = 12  # number of decimals to which ratios and offsets are rounded
+    zero: float = 1e-9  # absolute value of a ratio below which it counts as zero
     agree: float = 1e-6  # largest error [rad or m] of equalities that agree with each other
 
 

@@ -34,10 +34,11 @@ class UsualNumbers:
     force: Bounds = (0.1, 1000.0)  # effort of a sliding joint [N]
     turning: Bounds = (0.05, 200.0)  # velocity of a revolute joint [rad/s]
     sliding: Bounds = (1e-3, 10.0)  # velocity of a sliding joint [m/s]
-    hand_mass: Bounds = (0.05, 4.5)  # [kg]: a Shadow hand with its forearm has 4.3
-    # [kg/m3] of the box around a link's shapes, which may be a part of it: at most that of metals
+    hand_mass: Bounds = (0.05, 4.5)  # mass of a hand [kg]: a Shadow hand with its forearm has 4.3
+    # mass of a link over the volume of the box around its shapes [kg/m3]: at most that of metals;
+    # the box may be a part of the link
     density: Bounds = (20.0, 25_000.0)
-    edge: float = 5e-3  # least edge of this box [m], as flat shapes have no volume
+    edge: float = 5e-3  # least edge [m] of the box for this density, as flat shapes have no volume
 
 
 USUAL = UsualNumbers()

@@ -24,11 +24,12 @@ from torchgrasp.hand.urdf import LinkShape, Urdf, pose_of, read_visuals
 class VisualNumbers:
     """Bounds of the visual meshes of a hand."""
 
-    most_faces: int = 2000  # triangles of a link: more are not seen in a picture of a hand
-    # edge of the first grid cells [m] in which corners are joined if there are too many triangles
+    # greatest number of triangles of a link: more are not seen in a picture of a hand
+    most_faces: int = 2000
+    # edge [m] of the grid cells in which corners are joined first, if there are too many triangles
     first_cell: float = 5e-4
     growth: float = 1.3  # factor by which the cells grow until few enough triangles are left
-    letters: int = 60  # most letters of a link's name in the name of a file
+    letters: int = 60  # greatest number of letters of a link's name in the name of a file
 
 
 VISUAL = VisualNumbers()

@@ -108,12 +108,15 @@ JSON = "grasps.json"  # file beside the others that planning writes into its fol
 class ToolBounds:
     """Bounds of what a call may ask for, so that no call occupies the machine for long."""
 
-    starts: int = 2000  # most initial guesses: they take about a minute on a slow core
-    few: int = 300  # initial guesses by default: enough for most objects, in some ten seconds
-    listed: int = 20  # most grasps of an answer: each is about 2 kB for the agent to read
-    some: int = 3  # grasps of an answer by default
+    # greatest number of initial guesses: they take about a minute on a slow core
+    starts: int = 2000
+    # number of initial guesses by default: enough for most objects, in some ten seconds
+    few: int = 300
+    # greatest number of grasps of an answer: each is about 2 kB for the agent to read
+    listed: int = 20
+    some: int = 3  # number of grasps of an answer by default
     hold: float = 10.0  # longest time for which the raised object is held [s]
-    points: int = 20_000  # most points of a rendered view: a shape is fitted to fewer
+    points: int = 20_000  # greatest number of points of a rendered view: a shape is fitted to fewer
 
 
 BOUNDS = ToolBounds()

@@ -17,7 +17,7 @@ class ServerBounds:
     beat: float = 3.0  # time between two reports of progress [s]; clients give up after 30 or more
     request: int = 256 * 1024  # largest request by HTTP [bytes]: arguments are names and numbers
     last_port: int = 65_535  # largest number of a port
-    chunk: int = 65_536  # most bytes that are read from stdin at once
+    chunk: int = 65_536  # greatest number of bytes that are read from stdin at once
 
 
 SERVER = ServerBounds()

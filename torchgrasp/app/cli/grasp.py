@@ -74,8 +74,8 @@ OBJECT_WIDTHS = (-10, 7, -1)  # of the columns of a scene's objects
 
 @arguments(points="cloud", normals="cloud", path="out", target="label")
 class Grasp(ForPrograms):
-    """Plan grasps of an object in a partial cloud or a scene. With a mesh, also close the hand in
-    simulation.
+    """Plan grasps of an object in a partial cloud or a scene. With --close, also close the hand on
+    the object's mesh in simulation.
 
     Writes grasps.safetensors, surface.ply, report.html and the 3D page view.html into the output
     folder. If no grasp is executable, one setting at a time is changed, and the change that helps

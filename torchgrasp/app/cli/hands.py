@@ -67,14 +67,18 @@ class HandTrial:
     """Parameters of `hand check`: planning on shipped objects, and random postures to judge by."""
 
     objects: tuple[str, ...] = ("cylinder", "jug")  # names of the objects that are tried in turn
-    starts: int = 100  # initial guesses for each object
-    postures: int = 5000  # random postures
-    some: int = 500  # postures in which the pair of links that meets most often is sought
-    # least shares of the random postures of a hand with three fingers
-    least_free: float = 0.2  # least share of postures without self-collision
-    least_facing: float = 0.02  # least share in which a finger's pad faces the others
-    least_closing: float = 0.001  # least share that can hold an object
-    facing: float = 0.5  # cosine of the largest angle between a pad that faces and the middle
+    starts: int = 100  # number of initial guesses for each object
+    postures: int = 5000  # number of random postures
+    # number of postures in which the pair of links that collides most often is sought
+    some: int = 500
+    # least share of the random postures without self-collision, for a hand with three fingers
+    least_free: float = 0.2
+    # least share of the postures in which a finger's pad faces the other pads
+    least_facing: float = 0.02
+    least_closing: float = 0.001  # least share of the postures that can hold an object
+    # least cosine between the normal of a pad that faces the others and the direction to their
+    # middle
+    facing: float = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,10 +87,10 @@ class TrainNumbers:
 
     # least gain [nats] of the mean log-likelihood in a step of EM after which EM goes on
     tolerance: float = 1e-3
-    starts: int = 5  # k-means initialisations of the fit
-    subset: int = 300  # postures for each Gaussian in the smallest subset that is fitted
-    most: int = 64  # most Gaussians that are tried: the paper's figure ends at 60
-    postures: int = 40_000  # number by which the number of Gaussians is chosen
+    starts: int = 5  # number of k-means initialisations of the fit
+    subset: int = 300  # number of postures for each Gaussian in the smallest subset that is fitted
+    most: int = 64  # greatest number of Gaussians that are tried: the paper's figure ends at 60
+    postures: int = 40_000  # number of postures by which the number of Gaussians is chosen
 
 
 TRIAL = HandTrial()

@@ -54,7 +54,8 @@ SIZE = (720, 576)  # width and height of a still [pixels]: twice its size on a p
 class MarkShapes:
     """Sizes of points, arrows and the table in a picture, chosen by eye."""
 
-    point_radius: float = 0.006  # share of the diagonal of all points
+    # radius of a point, as a share of the diagonal of the box around all points
+    point_radius: float = 0.006
     # parts of an arrow, in lengths of the arrow; the shaft ends inside the head
     head_radius: float = 0.1  # radius of the head, a cone
     head_length: float = 0.35  # length of the head
@@ -62,12 +63,15 @@ class MarkShapes:
     shaft_radius: float = 0.035  # radius of the shaft, a cylinder
     shaft_length: float = 0.75  # length of the shaft
     ball_radius: float = 0.13  # radius of the ball at the arrow's start
-    arrow_sections: int = 8  # sides of head and shaft
-    table_radius: float = 0.55  # share of the diagonal of all corners seen from above
-    table_rim: float = 0.02  # added to the radius [m], so that a small object has a table, too
-    table_sections: int = 120  # corners of the round table top
+    arrow_sections: int = 8  # number of sides of head and shaft
+    # radius of the table top, as a share of the diagonal of all corners seen from above
+    table_radius: float = 0.55
+    # length [m] added to this radius, so that a small object has a table, too
+    table_rim: float = 0.02
+    table_sections: int = 120  # number of corners of the round table top
     table_thickness: float = 1e-4  # thickness of the table top [m]
-    # depths below the true height [m]: the object hides shadows, and shadows hide the table
+    # Depths [m] below the true height of the table: the object hides shadows, and shadows hide the
+    # table.
     table_depth: float = 1e-3  # depth of the table
     shadow_depth: float = 5e-4  # depth of the shadows
 
@@ -80,9 +84,12 @@ class Framing:
     # straight down, or up from below the table, a camera shows little
     lowest: float = 0.27  # least rise of the direction for each metre along the ground
     highest: float = 0.84  # greatest rise of the direction for each metre along the ground
-    margin: float = 1.12  # distance beyond the nearest at which all corners are in view
-    level: float = 1e-9  # a direction with less of x and y [m] is vertical
-    fallback: tuple[float, float] = (1.0, -0.8)  # x and y instead of a vertical direction
+    # distance of the camera, over the least one at which all corners are in view
+    margin: float = 1.12
+    # length of the horizontal part of a direction below which it counts as vertical
+    level: float = 1e-9
+    # x and y that replace those of a vertical direction
+    fallback: tuple[float, float] = (1.0, -0.8)
     bar_drop: float = 0.09  # share of the picture that stays empty below for a colour bar
     squeeze: float = 1.5  # loss of height for each empty share: the share, and half of it above
 

@@ -39,7 +39,7 @@ class FilmLayout:
     title_left: float = 0.04  # place of the title, as a share of the still's width
     font: int = 14  # size of titles and letters
     small_font: int = 12  # size of the titles of many stills, so that they fit
-    many: int = 6  # stills from which on the small font is used
+    many: int = 6  # number of stills from which on the small font is used
     tall_plot: int = 200  # height of a plot with a legend
     plot: int = 110  # height of a plot without a legend
     plot_gap: int = 50  # gap above each plot, for its title
@@ -58,7 +58,7 @@ class PlotStyle:
 
     font: int = 13  # size of titles and of the texts of axes
     title_gap: int = 9  # gap between a title and its plot
-    ticks: int = 3  # most intervals of the vertical axis
+    ticks: int = 3  # greatest number of intervals of the vertical axis
     line: float = 1.8  # width of a line
     wide: float = 4.0  # width of the line of the hand's height, which a held object's would cover
     handle: float = 1.2  # length of a line in the legend, in font sizes

@@ -26,8 +26,8 @@ from torchgrasp.values.planning import Grasps
 class SrgbCurve:
     """The curve from sRGB colours to linear light, as IEC 61966-2-1 defines it."""
 
-    dark: float = 0.04045  # up to this value the curve is straight
-    slope: float = 12.92  # values of the straight part are divided by it
+    dark: float = 0.04045  # greatest sRGB value of the straight part of the curve
+    slope: float = 12.92  # divisor of the values of the straight part
     # a larger value v becomes ((v + offset) / (1 + offset)) ** gamma
     offset: float = 0.055
     gamma: float = 2.4  # exponent of the curved part

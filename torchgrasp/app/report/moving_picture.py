@@ -39,11 +39,11 @@ class MovieLayout:
 
     size: tuple[int, int] = (560, 448)  # width and height [pixels]; even, as H.264 needs
     longest: float = 60.0  # longest closing that is filmed [s]
-    colors: int = 256  # most colours of a GIF
-    samples: int = 12  # pictures from which the colours of a GIF are taken
+    colors: int = 256  # greatest number of colours of a GIF
+    samples: int = 12  # number of pictures from which the colours of a GIF are taken
     tick: float = 0.01  # unit of the times in a GIF [s]
-    quality: int = 20  # quality of H.264 ("crf"): a lower number gives a larger, sharper file
-    most_error: int = 200  # most characters of ffmpeg's own message in an error
+    quality: int = 20  # quality of H.264 (its "crf"): a lower number gives a larger, sharper file
+    most_error: int = 200  # greatest number of characters of ffmpeg's own message in an error
 
 
 MOVIE = MovieLayout()

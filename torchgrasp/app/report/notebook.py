@@ -26,8 +26,9 @@ from torchgrasp.values.planning import Grasps, PointCloud
 class NotebookNumbers:
     """Sizes of what a notebook shows of grasps."""
 
-    rows: int = 5  # best grasps in the table: more are seldom read
-    colors: int = 64  # colours of the picture: a notebook stays small, and shades stay smooth
+    rows: int = 5  # number of best grasps in the table: more are seldom read
+    # number of colours of the picture: a notebook stays small, and shades stay smooth
+    colors: int = 64
 
 
 NOTEBOOK = NotebookNumbers()

@@ -19,9 +19,10 @@ class RasterNumbers:
     samples: int = 2  # number of samples along each axis of a pixel; their mean gives smooth edges
     opacity: float = 0.5  # opacity of transparent triangles, in [0, 1]
     nearest: float = 1e-6  # least distance from the camera [m]; the scene is framed in front of it
-    thinnest: float = 1e-9  # twice the least area [pixels]: seen from its edge, a triangle is thin
-    # Triangles that share an edge both cover a centre within this distance [pixels] of it. So no
-    # crack is left between them.
+    # twice the area [px^2] of a triangle below which it is not drawn: it is seen from its edge
+    thinnest: float = 1e-9
+    # Distance [pixels] from an edge that two triangles share, within which both cover the centre of
+    # a pixel. So no crack is left between them.
     tie: float = 1e-6
 
 

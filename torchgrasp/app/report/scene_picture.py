@@ -37,23 +37,27 @@ class SceneInk:
     """Parameters of the shading of a scene's pixels, chosen by eye; factors darken a colour."""
 
     size: int = 1200  # longer side of the picture [pixels]
-    hatches: int = 160  # stripes over the width, on obstacles
-    hatch: float = 0.8  # factor of every other stripe
+    hatches: int = 160  # number of stripes over the width, on obstacles
+    hatch: float = 0.8  # factor on the colour of every other stripe
     flat: float = 0.6  # least brightness of what is on no object: relief matters most on objects
     cell: float = 0.1  # side of the squares drawn on the support [m]
     line: float = 0.25  # share of the colour that lines between squares lose
     line_width: float = 1.2  # width of these lines [pixels]
-    # widest pixel, as a share of a square, with lines: lines of smaller squares would run together
+    # greatest width of a pixel, as a share of a square, with lines: lines of smaller squares would
+    # run together
     widest_pixel: float = 0.3
-    gap: int = 5  # side [pixels] of the squares in which missing pixels have no rim
+    # side [pixels] of the square within which a label spreads over missing pixels, so that they
+    # have no rim
+    gap: int = 5
     rim: int = 3  # width of the dark rim of an object [pixels]
-    rim_factor: float = 0.5  # factor of the rim
+    rim_factor: float = 0.5  # factor on the colour of this rim
     target_rim: int = 5  # width of the white rim of the target [pixels]
-    noise: float = 3.0  # standard deviations of the noise that a support's pixels may lie off it
+    # greatest distance of the pixels of a support from it, in standard deviations of the noise
+    noise: float = 3.0
     blur: float = 1.5  # standard deviation [pixels] that smooths the depth before its slopes
     nearest: float = 1e-3  # least depth [m]
     least: float = 1e-6  # least weight, slope and range, so that nothing is divided by 0
-    # added to the unit vector that points up, it is the direction to the lamp (right, down, ahead)
+    # direction to the lamp (right, down, ahead), less the unit vector that points up
     lamp: tuple[float, float, float] = (-0.5, 0.0, -0.8)
     ambient: float = 0.45  # brightness without the lamp
     lit: float = 0.65  # brightness that the lamp adds at most
@@ -65,7 +69,7 @@ class SceneInk:
 class SceneText:
     """Layout of the numbers on objects and of the legend [pixels]."""
 
-    font: int = 24  # size of the legend's text, and the least of a number
+    font: int = 24  # size of the legend's text, and least size of a number on an object
     number: float = 1.1  # size of a number, in radii of the largest circle in its object
     largest_number: int = 54  # largest size of a number
     stroke: int = 3  # width of the dark rim of a number
@@ -78,9 +82,11 @@ class SceneText:
     left: int = 16  # left end of the first column
     gutter: int = 70  # width that a column needs beside its widest text
     margin: int = 12  # margin above and below all lines of the legend
-    most_objects: int = 12  # most objects that the legend names
-    least_share: float = 0.002  # least share of the pixels of a kind that is in the legend
-    top: float = 0.98  # quantile of the heights of an object's points: few outliers
+    most_objects: int = 12  # greatest number of objects that the legend names
+    # least share of the pixels that a kind, such as obstacles, has in order to be in the legend
+    least_share: float = 0.002
+    # quantile of the heights of an object's points that counts as its top: few are outliers
+    top: float = 0.98
 
 
 INKS = SceneInk()

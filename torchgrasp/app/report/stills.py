@@ -29,10 +29,11 @@ from torchgrasp.values.planning import Contacts, Grasps, PointCloud
 class StillLayout:
     """Limits and sizes of what stills show."""
 
-    most_points: int = 3000  # most points of a cloud: more would hide each other
+    # greatest number of points of a cloud that are drawn: more would hide each other
+    most_points: int = 3000
     # least divisor [m] of the heights that give colours: a flat cloud has one colour
     least_height: float = 1e-12
-    most_others: int = 4000  # most points of all neighbours
+    most_others: int = 4000  # greatest number of points of all neighbours that are drawn
     contact_arrow: float = 0.045  # length of an arrow at a contact [m]: about a fingertip
     tip_arrow: float = 0.03  # length of the arrow at a pad of a hand without grasp [m]
     palm_axis: float = 0.6  # length of the axes, as a share of the diagonal of the palm

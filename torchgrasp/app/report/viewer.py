@@ -53,14 +53,15 @@ class ViewerNumbers:
     With these limits a page has a few megabytes.
     """
 
-    grasps: int = 20  # best grasps that are shown
-    points: int = 10_000  # most points of a cloud
-    faces: int = 40_000  # most faces of a mesh
-    ticks: int = 120  # most ticks of a replay
-    cells: int = 256  # first grid cells along the diagonal of a mesh that is thinned
+    grasps: int = 20  # number of the best grasps that are shown
+    points: int = 10_000  # greatest number of points of a cloud
+    faces: int = 40_000  # greatest number of faces of a mesh
+    ticks: int = 120  # greatest number of ticks of a replay
+    # number of grid cells along the diagonal of a mesh in the first round of its thinning
+    cells: int = 256
     coarser: float = 1.2  # ratio of the cells' sides in successive rounds of thinning
     rise: float = 0.35  # least rise of the first view for each metre along the ground
-    ramp: int = 17  # colours of the bar of standard deviations
+    ramp: int = 17  # number of colours of the bar of standard deviations
 
 
 VIEWER = ViewerNumbers()

@@ -57,7 +57,9 @@ def state_of(
 
 
 def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the distances [m] of three fingertips' centres `tips` [m] from their centroid."""
+    """Return the distances (*b, 3) [m] of three fingertips, with centres `tips` (*b, 3, 3) [m],
+    from their centroid.
+    """
     return norm(tips - tips.mean(-2, keepdim=True))
 
 

@@ -36,12 +36,11 @@ class AxisNumbers:
     """Parameters of the fits of a body's axis of revolution to the normals of its cloud."""
 
     half_weight: float = 0.004
-    """Distance [m] of a normal's line from the axis at which it has half the weight."""
+    """Distance [m] of a normal's line from the axis at which the line has half the weight."""
     first_half_weight: float = 0.02
+    """This distance [m] in the first step of the fit of a tilted axis."""
     narrowing: float = 0.6
-    """The distance of half weight [m] in the first step of the fit of a tilted axis. Its excess
-    over `half_weight` is multiplied by `narrowing` from step to step.
-    """
+    """Factor by which its excess over `half_weight` shrinks from step to step."""
     steep: float = 0.3
     """Least length of the horizontal part of the unit normals that fit a vertical axis."""
     rounds: int = 30
@@ -51,12 +50,13 @@ class AxisNumbers:
     steps: int = 12
     """Number of Gauss-Newton steps of the fit of a tilted axis."""
     damping: float = 1e-6
-    least_diagonal: float = 1e-9
-    """Share of the normal equations' diagonal that is added to it, and its least value. A ball does
-    not determine the axis's direction, and a prism not its position along a side.
+    """Share of the diagonal of the normal equations that is added to it. A ball does not determine
+    the axis's direction, and a prism not its position along a side.
     """
+    least_diagonal: float = 1e-9
+    """Least value of the diagonal of which this share is taken."""
     turn: float = 0.3
-    """Greatest rotation [rad] of the axis in a step: the lines' distances are linear only in small
+    """Greatest rotation [rad] of the axis in a step. The lines' distances are linear only in small
     rotations.
     """
     cost: float = 1.0
@@ -71,30 +71,38 @@ class RoundNumbers:
     """Bounds within which a body counts as a body of revolution."""
 
     miss: float = 0.2
-    least_radius: float = 0.01
-    """A normal meets the axis if its line is at most `miss` times the radius of the point away. If
-    it is greater, `least_radius` [m] takes the place of this radius.
+    """Greatest distance from the axis of a normal's line that meets it, over the radius of its
+    point.
     """
+    least_radius: float = 0.01
+    """Least radius [m] that is used as this divisor."""
     roundness: float = 0.055
+    """Greatest RMS distance of the normals' lines from a tilted axis, over the radius, without
+    `error`.
+    """
     error: float = 0.0018
-    """Usual distance of the normals' lines: a share of the radius, and an error [m]."""
+    """Error [m] in this distance that is the same for all radii; the squares of both parts are
+    added.
+    """
     spread: float = 0.075
-    """Greatest RMS distance of the normals' lines, over the radius, of an upright body."""
+    """Greatest RMS distance of the normals' lines from the axis of an upright body, over its
+    radius.
+    """
     body_share: float = 0.6
-    """Least share of the cloud on the body; other points are an attached part."""
+    """Least share of the cloud that is on the body; other points are an attached part."""
     near: float = 0.004
-    """Greatest distance [m] in height of two points of one slice, and in radius of a point from its
-    slice's median.
+    """Greatest difference [m] of height between points of one slice of the body. It is also the
+    greatest distance [m] of a point's radius from the median of its slice.
     """
     one_way: float = 0.95
-    """Greatest length of the mean of the horizontal unit normals: one flat side gives a longer one.
+    """Greatest length of the mean of the horizontal unit normals: one flat side gives a longer
+    mean.
     """
     turns: int = 12
     """Number of parts of a full circle by which the body is rotated, to compare it with free space.
     """
     inside: float = 0.003
-    """Depth [m] in free space or in the table from which a rotated point is no part of the object.
-    """
+    """Depth [m] in free space or in the table beyond which a rotated point is not on the object."""
     free: float = 0.12
     """Greatest share of such points in the rotated body."""
 
@@ -104,9 +112,9 @@ ROUND = RoundNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Revolution:
-    """A body of revolution about a vertical axis."""
+    """A body of revolution about a vertical axis, found in a cloud of n points."""
 
-    center: Float[Tensor, "2"]  # position (x, y) of the axis [m]
+    center: Float[Tensor, "2"]  # position (x, y) [m] of the axis, in the frame of the cloud
     body: Bool[Tensor, "n"]  # mask of the cloud's points on the body
 
 

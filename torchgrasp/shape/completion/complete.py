@@ -37,22 +37,26 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class HiddenNumbers:
-    """Parameters of the points that complete a cloud on its hidden side."""
+    """Parameters of the estimated points that complete a cloud on the object's hidden side."""
 
     new: float = 0.006
-    """Least distance [m] of a hidden point from the cloud."""
+    """Least distance [m] of a hidden point from the points of the cloud."""
     spacing: float = 0.004
-    """Least distance [m] of a hidden point from another one."""
+    """Least distance [m] between two hidden points."""
     noise: float = 0.003
     """Standard deviation [m] of a mirrored point of an object that is exactly symmetric."""
     part: float = 0.02
-    """Length scale [m] of the asymmetry: a part without a mirror image is missing as a whole."""
+    """Distance [m] over which errors of hidden points, due to an asymmetry of the object, are alike
+    (correlated). A part that has no mirror image is missing as a whole.
+    """
     foot: float = 0.004
     """Greatest height [m] above the table of points on the face on which the object stands."""
     down: float = -0.7
-    """Greatest vertical part of the unit normals of this face, which point down."""
+    """Greatest component, along the upward direction, of the unit normals of this face, which point
+    down.
+    """
     attached: int = 20
-    """Least points of an attached part, such as a handle."""
+    """Least number of points of a part attached to a body of revolution, such as a handle."""
 
 
 HIDDEN = HiddenNumbers()
@@ -63,18 +67,22 @@ class MirrorNumbers:
     """Parameters of the standard deviation of points that are mirrored to the hidden side."""
 
     symmetric: float = 0.45
-    """Score from which an object counts as symmetric."""
+    """Score of a mirror plane from which on an object counts as symmetric."""
     asymmetry: float = 0.060
-    """Asymmetry [m] for each 1 by which the score is below that of a symmetric object."""
+    """Standard deviation [m] of mirrored points because of asymmetry, for each 1 by which the score
+    is below `symmetric`.
+    """
     temperature: float = 0.1
-    """A plane's probability is proportional to exp(score / temperature)."""
+    """Temperature of the planes' probabilities, which are proportional to exp(score / temperature).
+    """
     near: int = 5
-    """Number of steps along each axis of the grid of planes near a plane."""
+    """Number of planes, along each axis of a grid, that are compared near a mirror plane."""
     angle: float = 0.15
+    """Greatest rotation [rad] of these planes."""
     shift: float = 0.045
-    """Farthest of these planes: angle [rad], and shift over the size of the cloud."""
+    """Greatest shift of these planes, over the size of the cloud."""
     twice: float = 0.05
-    """Score that an image loses if it is mirrored twice: single images come first."""
+    """Score that an image loses by being mirrored twice, so that single images come first."""
 
 
 MIRROR = MirrorNumbers()
@@ -85,19 +93,20 @@ class BarNumbers:
     """Parameters by which the thin bars of a frame-like object are found and completed."""
 
     thin: float = 0.012
-    """Width [m] below which a part is a bar: that of a fingertip."""
+    """Width [m] below which a part of an object is a bar: that of a fingertip."""
     empty: float = 0.5
     """Greatest distance of a frame's centre from the outline, inside of it. It is divided by the
     distance of the centre from the cloud.
     """
     neighbours: int = 30
-    """Number of neighbouring points that give width and direction, the same as for fitted
+    """Number of neighbouring points that show the width and direction of a bar, as for fitted
     normals.
     """
     middle: float = 0.8
     """Least width at a point in the middle of a bar, as a share of the bar's width."""
     deviation: float = 0.5
-    """Standard deviation of a point on the far side, as a share of the width."""
+    """Standard deviation of an estimated point on the far side of a bar, as a share of the width.
+    """
 
 
 BAR = BarNumbers()
@@ -110,23 +119,26 @@ SomeHidden = TypeVar("SomeHidden", bound=Any)  # a batch with `points` [m]
 
 @dataclasses.dataclass(frozen=True)
 class Completion(Value):
-    """Estimated m points of the hidden side, with their errors along the normals.
+    """The estimated hidden side of an object in a view: m points, with their errors along the
+    normals.
 
     The errors have the covariance noise^2 I + D D^T [m^2]. I is the identity, D is `deviations`,
-    and noise is 3 mm (`HIDDEN.noise`).
+    and noise is 3 mm (`HIDDEN.noise`). Points are in the frame of the cloud.
     """
 
-    points: Float[Tensor, "m 3"]  # points on the hidden side [m]
+    points: Float[Tensor, "m 3"]  # estimated points [m] on the hidden side
     normals: Float[Tensor, "m 3"]  # outward unit normals
-    # standard deviations [m] of c errors, which the mirror planes cause
+    # errors [m] of the points, one column for each of c causes at one standard deviation of it; the
+    # causes are errors of the mirror planes
     shared: Float[Tensor, "m c"]
-    # standard deviation [m] of a smooth error, because the object is not quite symmetric
+    # standard deviation [m] of a smooth error of each point, because the object is not quite
+    # symmetric
     asymmetry: Float[Tensor, "m"]
     # p mirror planes n.x = o [m], as (n, o); for each part of the object, its best plane is first
     planes: Float[Tensor, "p 4"]
-    # of the planes: 1 if the mirror image lies on the cloud, near 0 if nothing confirms it
+    # score of each plane: 1 if the mirror image lies on the cloud, near 0 if nothing confirms it
     scores: Float[Tensor, "p"]
-    outline: Outlines
+    outline: Outlines  # silhouettes of all views of the cloud
     kind: Kind  # how the hidden side was completed, which selects the calibration
     frame: bool = False  # whether the object is a frame of bars round an empty middle
 

@@ -25,32 +25,39 @@ class EllipsoidNumbers:
     """Parameters and bounds of the least-squares fit of an ellipsoid to a cloud."""
 
     points: int = 300
-    """Most points of the cloud in the fit."""
+    """Greatest number of points of the cloud in the fit."""
     independent: int = 60
+    """Number of points of the cloud that count as independent."""
     independent_rim: int = 8
-    """Numbers of points of the cloud and of the outline that count as independent."""
+    """Number of points of the outline that count as independent."""
     point: float = 0.001
+    """Standard deviation [m] of a point of the cloud."""
     slope: float = 0.15
+    """Standard deviation of a component of a unit normal."""
     rim: float = 0.002
+    """Standard deviation [m] of the outline."""
     table: float = 0.001
-    """Standard deviations of a point [m], a unit normal, the outline [m] and the table [m]."""
+    """Standard deviation [m] of the table's height."""
     elongation: float = 0.03
-    """Standard deviation of the logarithm of an axis over the mean axis."""
+    """Standard deviation of the logarithm of an axis over the mean axis, before the fit."""
     misfit: float = 0.00165
+    """Greatest RMS distance [m] of the cloud from the ellipsoid."""
     relative_misfit: float = 0.052
-    """Greatest RMS distance of the cloud, in metres and in mean radii."""
+    """Greatest RMS distance of the cloud from the ellipsoid, over the mean radius."""
     agreement: float = 0.9
-    """Least mean cosine of the normals with those of the ellipsoid."""
+    """Least mean cosine of the cloud's normals with those of the ellipsoid."""
     longest: float = 1.5
-    """Greatest ratio of two axes: a longer body is no ball."""
+    """Greatest ratio of two axes of the ellipsoid: a longer body is no ball."""
     spread: int = 400
-    """Number of points over the whole ellipsoid."""
+    """Number of points that are spread over the whole ellipsoid."""
     step: float = 1e-5
-    """Step of the parameters ([m], or of a logarithm) by which these points are differentiated."""
+    """Step of the ellipsoid's parameters ([m], or of a logarithm) by which these points are
+    differentiated.
+    """
     least_radius: float = 0.25
-    """Least radius of the first ball, over the longest side of the cloud."""
+    """Least radius of the ball with which the fit begins, over the longest side of the cloud."""
     evaluations: int = 40
-    """Most evaluations of the fit."""
+    """Greatest number of evaluations of the residuals in the fit."""
     forward: float = float(np.sqrt(np.finfo(float).eps))
     """Relative step of the residuals' finite differences: a parameter p is changed by `forward` *
     max(1, |p|).

@@ -25,40 +25,44 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class OutlineNumbers:
-    """Parameters of the outline of a cloud in its camera's image.
+    """Parameters of the outline (silhouette) of a cloud in its camera's image.
 
     A spacing is the distance of neighbouring pixels at depth 1 (no unit).
     """
 
     grow: float = 2.0
+    """Radius, in spacings, of the discs about the pixels whose union is the outline at first."""
     shrink: float = 1.65
-    """The outline is a union of discs of the radius `grow` about the pixels. It is then shrunk by
-    `shrink`, both in spacings.
-    """
+    """Distance, in spacings, by which this outline is then shrunk."""
     neighbours: int = 5
     """Number of nearest pixels, with the pixel itself, of which the farthest gives the spacing."""
     fine: float = 4.0
-    """Number of the raster's cells in one spacing."""
+    """Number of cells of the raster in one spacing."""
     cells: int = 320
-    """Most cells along the object."""
+    """Greatest number of cells of the raster along the object."""
     margin: float = 0.25
-    """Margin of the raster, as a share of the object's extent: points beside it are looked up."""
+    """Margin of the raster about the object, as a share of the object's extent: points beside it
+    are looked up.
+    """
     front: float = 0.002
-    """Distance [m] by which noise may move a point in front of the visible surface."""
+    """Distance [m] in front of the visible surface up to which a point may be there by noise alone.
+    """
     beside: float = 0.001
-    """Greatest distance [m] of a hidden point from the outline, outside of it."""
+    """Greatest distance [m] outside the outline of a point that counts as hidden."""
     least_depth: float = 1e-9
     """Least depth [m] of a point: points behind the camera count as far outside."""
     edge: float = 0.75
-    """Greatest distance [cells] of a node that lies on the outline."""
+    """Greatest distance [cells] from the outline of a node that lies on it."""
     smooth: float = 3.0
-    """Standard deviation [cells] of the blur before the slope of the outline is taken."""
+    """Standard deviation [cells] of the blur of the distance from the outline, before its slope is
+    taken.
+    """
     least_slope: float = 1e-12
-    """Least length of this slope, which bounds a divisor."""
+    """Least length of this slope that is a divisor."""
     rim: int = 16
-    """Most points of the outline."""
+    """Greatest number of points that are taken on the outline."""
     rim_neighbours: int = 4
-    """Number of pixels beside such a point, whose median depth it gets."""
+    """Number of pixels beside such a point whose median depth it gets."""
 
 
 OUTLINE = OutlineNumbers()
@@ -66,14 +70,16 @@ OUTLINE = OutlineNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class BehindNumbers:
-    """Bounds beyond which a cloud is not a single view."""
+    """Bounds beyond which a cloud shows both sides of an object, and so is not a single view."""
 
     share: float = 0.2
-    """Greatest share of points behind others."""
+    """Greatest share of points of a view that are behind others."""
     radius: float = 0.3
-    """Depth by which a point is behind another, as a share of the cloud's radius."""
+    """Depth behind a neighbour, as a share of the cloud's radius, from which on a point is behind
+    it.
+    """
     neighbours: int = 6
-    """Number of pixels, with the pixel itself, that a point is compared with."""
+    """Number of nearest pixels, with the pixel itself, with which a point is compared."""
 
 
 BEHIND = BehindNumbers()
@@ -98,19 +104,22 @@ def pick_apart(
 
 @dataclasses.dataclass(frozen=True)
 class Silhouette(Value):
-    """The outline and visible depth of one view, as rasters on the image plane at depth 1.
+    """The outline of an object and its visible depth in one view, as rasters.
 
-    A raster has h x w nodes.
+    The rasters have h x w nodes on the image plane at depth 1. Lengths on this plane have no unit.
     """
 
     viewpoint: Float[Tensor, "3"]  # position of the camera, in the frame of the cloud [m]
     axes: Float[Tensor, "3 3"]  # unit vectors right, down and forward of the camera, one a line
-    corner: Float[Tensor, "2"]  # first node (x, y) of the raster, at depth 1
-    cell: float  # distance of neighbouring nodes, at depth 1
-    outside: Float[Tensor, "h w"]  # signed distance to the outline at depth 1, positive outside
+    # position (x, y) of the first node of the rasters, on the image plane
+    corner: Float[Tensor, "2"]
+    cell: float  # distance of neighbouring nodes, on the image plane
+    # signed distance of each node from the outline, on the image plane; positive outside
+    outside: Float[Tensor, "h w"]
     # at each node, the depth [m] of the visible pixel nearest to the node
     depth: Float[Tensor, "h w"]
-    rim: Float[Tensor, "k 3"]  # points of the outline [m] at the visible depth
+    # k points [m] of the outline at the visible depth, in the frame of the cloud
+    rim: Float[Tensor, "k 3"]
     # outward unit normals at the points of `rim`, perpendicular to the camera rays
     rim_normals: Float[Tensor, "k 3"]
     # whether the object reaches the border of the image; points beyond do not count as outside
@@ -185,16 +194,16 @@ class Silhouette(Value):
 class Outlines(Value):
     """The silhouettes of all views of one object, which lies within the outline of every view."""
 
-    views: tuple[Silhouette, ...]
+    views: tuple[Silhouette, ...]  # the silhouette of each view
 
     @property
     def rim(self) -> Float[Tensor, "k 3"]:
-        """Points [m] on the outlines of all views, at the depth of nearby pixels."""
+        """Points (k, 3) [m] on the outlines of all views, at the depth of nearby pixels."""
         return torch.cat([view.rim for view in self.views])
 
     @property
     def rim_normals(self) -> Float[Tensor, "k 3"]:
-        """The outward unit normals of the surface at the points of `rim`."""
+        """The outward unit normals (k, 3) of the object's surface at the points of `rim`."""
         return torch.cat([view.rim_normals for view in self.views])
 
     @property

@@ -37,15 +37,19 @@ class SymmetryNumbers:
     """Parameters of the score by which mirror planes of a cloud are compared."""
 
     match: float = 0.003
-    """Length scale [m] of the distances over which a mirrored point stops matching the cloud."""
+    """Length scale [m] of the distances over which a mirrored point's match with the cloud falls to
+    0.
+    """
     far: float = 4.0
-    """Greatest distance of a match, over this length."""
+    """Greatest distance of a match with the cloud, in multiples of `match`."""
     worst: float = 3.0
-    """Depth in free space, over the same length, from which a point's violation is the greatest."""
+    """Depth of a mirrored point in free space, in multiples of `match`, from which on its violation
+    is the greatest.
+    """
     probes: int = 150
-    """Most points of the cloud that score a plane."""
+    """Greatest number of points of the cloud (probes) by which a plane is scored."""
     leaf: int = 32
-    """Most points in a leaf of the k-d tree of all points."""
+    """Greatest number of points in a leaf of the k-d tree of all points."""
 
 
 SYMMETRY = SymmetryNumbers()
@@ -59,54 +63,62 @@ class PlaneSearchNumbers:
     """
 
     sphere: int = 160
-    """Directions over a whole sphere, of which half are tried: n and -n are one plane."""
+    """Number of directions over a whole sphere, of which half are tried: n and -n are one plane."""
     level: int = 24
-    """Directions of upright planes that are tried."""
+    """Number of directions of upright planes that are tried."""
     level_through_axis: int = 96
-    """Directions of planes that are tried for a part attached to a body of revolution."""
+    """Number of directions of planes that are tried for a part attached to a body of revolution."""
     offsets: int = 17
+    """Number of offsets that are tried for each direction of a plane."""
     fine_offsets: int = 65
-    """Offsets tried for each direction of a plane, and for a known direction."""
+    """Number of offsets that are tried for a known direction."""
     least_extent: float = 0.15
     """Least half range of the offsets, as a share of the cloud's size."""
     one_side: float = 0.05
-    """Least length of the mean viewing direction of one side. It is shorter for views from above,
-    or from several sides.
+    """Least length of the mean viewing direction of views from one side. It is shorter for views
+    from above, or from several sides.
     """
     hides: float = 0.35
+    """|Cosine| between a plane's normal and the viewing direction from which on mirror images are
+    on the hidden side.
+    """
     facing: float = 0.7
-    """Absolute cosines between a plane's normal and the viewing direction. Above the first, the
-    mirror images are on the hidden side. Above the second, the plane faces the camera.
+    """|Cosine| between the normal of a plane and the viewing direction above which the plane faces
+    the camera.
     """
     rim_prior: float = 0.15
-    rim_distance: float = 0.25
-    """Score that a plane loses, and the distance from the rim, over the size, at which it does. A
-    view ends near the plane.
+    """Score that a plane loses at the distance `rim_distance` from the rim of the view. A view ends
+    near the mirror plane.
     """
+    rim_distance: float = 0.25
+    """Distance from the rim at which a plane loses `rim_prior`, over the size of the cloud."""
     square: float = 0.1
+    """Greatest |cosine| of planes that count as perpendicular to the best one."""
     square_prior: float = 0.1
-    """Greatest cosine of planes perpendicular to the best one, and the score that these gain."""
+    """Score that planes perpendicular to the best one gain."""
     most: int = 4
-    """Most planes that are chosen from all directions."""
+    """Greatest number of planes that are chosen from all directions."""
     within: float = 0.12
-    """Greatest difference of score from the best plane."""
+    """Greatest difference of the score of a chosen plane from that of the best one."""
     apart: float = math.cos(math.radians(25.0))
-    """Cosine above which two planes mirror to the same points."""
+    """|Cosine| above which two planes mirror to the same points."""
     square_apart: float = 0.42
-    """Cosine above which a plane replaces one that is perpendicular to the best plane."""
+    """|Cosine| above which a plane replaces one that is perpendicular to the best plane."""
     violation: float = 0.15
     """Greatest mean violation of free space, in [0, 1], of a plane that no point confirms."""
     slope: float = 0.15
-    """A plane with nearly the best plane's normal is dropped if its score is lower than the best by
-    this: it matches the cloud only because it is near the best plane.
+    """Difference of the score from the best one above which a plane is dropped. This holds for
+    planes with nearly the best plane's normal. They match the cloud only because they are near that
+    plane.
     """
     end_score: float = 0.4
     """Least score of the plane that mirrors the ends of a body of revolution."""
     widths: tuple[float, ...] = (1.0, 0.5, 0.25)
     """Widths of the grids that refine a plane, each half as wide as the last."""
     angle: float = 0.06
+    """Step of the widest grid in the rotation of a plane [rad]."""
     shift: float = 0.04
-    """Steps of the widest grid: angle [rad], and shift over the size."""
+    """Step of the widest grid in the shift of a plane, over the size of the cloud."""
 
 
 SEARCH = PlaneSearchNumbers()
@@ -124,20 +136,20 @@ where no single side is hidden.
 
 @dataclasses.dataclass(frozen=True)
 class SymmetryScorer:
-    """The scorer of mirror planes: it mirrors some points of the cloud and compares them with what
-    is known.
+    """The scorer of mirror planes of a cloud: it mirrors some points, the probes, and judges their
+    images.
 
-    These points are the probes. Their images are compared with the cloud, its outlines and the
-    table. The z axis of an `upright` scorer is the vertical direction, or the axis of a body of
-    revolution.
+    The images are compared with the cloud, with the outlines of the views, and with the table. All
+    is in the frame of the cloud. The z axis of an `upright` scorer is the vertical direction, or
+    the axis of a body of revolution.
     """
 
-    points: Points  # points (n, 3) of the cloud [m]
-    normals: Points  # (n, 3), outward unit normals
+    points: Points  # points (n, 3) [m] of the cloud
+    normals: Points  # outward unit normals (n, 3) at these points
     outline: Outlines  # silhouettes of the views
-    table: Plane | None  # None: no table
+    table: Plane | None  # the table; None means no table
     upright: bool  # whether all planes are parallel to z
-    rows: Int[Tensor, "k"]  # indices of the probes
+    rows: Int[Tensor, "k"]  # indices in `points` of the k points from which probes are chosen
 
     @classmethod
     def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":

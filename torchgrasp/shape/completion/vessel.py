@@ -29,15 +29,18 @@ class VesselNumbers:
     shorter.
     """
     terms: int = 4
-    """Number of coefficients of the outer radius as a polynomial of the height: a cubic one."""
+    """Number of coefficients of the outer radius as a polynomial of the height: those of a cubic
+    one.
+    """
     top: float = 0.98
-    """Quantile of the heights that is the top: noise lifts some points above the rim."""
+    """Quantile of the heights of the points that is the top: noise lifts some points above the rim.
+    """
     below_top: float = 0.002
     """Height [m] below the top from which points join the fit."""
     rounds: int = 30
     """Number of rounds of the fit; each has new weights."""
     miss: float = 0.006
-    """Distance [m] of a point from its wall at which it has half the weight in the last rounds."""
+    """Distance [m] of a point from its wall at which its weight in the last rounds is a half."""
     wider: float = 4.0
     """Excess of this distance over `miss` in the first round, in multiples of `miss`: the axis is
     not yet known.
@@ -47,8 +50,9 @@ class VesselNumbers:
     on_body: float = 0.002
     """Greatest distance [m] of a point of the body from its wall: twice a camera's noise."""
     thinnest: float = 0.0003
+    """Least thickness [m] of a fitted wall."""
     thickest: float = 0.012
-    """Bounds of the thickness [m] of a fitted wall."""
+    """Greatest thickness [m] of a fitted wall."""
     floor: float = 0.7
     """Vertical part of a unit normal from which a point inside the mouth belongs to the floor."""
     rim: float = 0.003
@@ -58,19 +62,22 @@ class VesselNumbers:
     body_share: float = 0.65
     """Least share of the points on walls that lie on the fitted body."""
     inner_share: float = 0.09
+    """Least share of the cloud that is on the inner wall."""
     outer_share: float = 0.07
-    """Least shares of the cloud on either wall."""
+    """Least share of the cloud that is on the outer wall."""
     depth: float = 0.012
     """Least depth [m] below the rim to which the inside is seen: the recess of a lid is no cavity.
     """
     usual: float = 0.0035
+    """Usual thickness [m] of a wall."""
     spread: float = 0.0015
-    """Usual thickness [m] of a wall, and its standard deviation [m]."""
+    """Standard deviation [m] of the usual thickness."""
     error: float = 0.0012
     """Standard deviation [m] of a fitted thickness."""
     least_slope: float = 1e-9
+    """Least length of the horizontal part of a unit normal that is a divisor."""
     least_spread: float = 1e-6
-    """Bounds of divisors: of a normal's horizontal part, and of the deviation of heights [m]."""
+    """Least standard deviation of the heights [m] that is a divisor."""
 
 
 VESSEL = VesselNumbers()
@@ -81,26 +88,35 @@ class WallNumbers:
     """Parameters of the points that complete the hidden parts of a vessel's walls."""
 
     center: float = 0.0006
+    """Standard deviation [m] of the position of the vessel's axis, on each of two axes."""
     form: float = 0.001
+    """Standard deviation [m] of a wall's form, a smooth error of its hidden points."""
     floor: float = 0.003
-    """Standard deviations [m] of the axis, of the form and of an unseen floor."""
+    """Standard deviation [m] of the height of a floor that was not seen."""
     up: float = 0.9
-    """Least vertical part of the unit normals of a seen floor."""
+    """Least component along z of the unit normals of a seen floor."""
     floor_points: int = 10
     """Number of points that a seen floor must exceed."""
     floor_rings: tuple[tuple[float, int], ...] = ((0.0, 1), (0.4, 5), (0.75, 8))
+    """Rings of points on an unseen floor. Each has its radius, as a share of the floor's, and its
+    number of points.
+    """
     lid_rings: tuple[tuple[float, int], ...] = ((0.0, 1), (0.5, 6))
-    """Rings of points on an unseen floor and on a lid. Each has its radius as a share of that of
-    the floor or lid, and its number of points.
+    """Rings of points on a lid. Each has its radius, as a share of the lid's, and its number of
+    points.
     """
     turned: int = 80
-    """Most points of a wall that are rotated about the axis."""
+    """Greatest number of points of a wall that are rotated about the axis, to estimate its hidden
+    parts.
+    """
     turns: int = 24
-    """Number of parts of a full circle by which they are rotated."""
+    """Number of parts of a full circle by which these points are rotated."""
     thinned: int = 200
-    """Most hidden points of one part that are compared with other parts."""
+    """Greatest number of hidden points of one part of a wall that are compared with those of other
+    parts.
+    """
     budget: int = 50
-    """Most hidden points of one wall."""
+    """Greatest number of hidden points of one wall."""
 
 
 WALL = WallNumbers()
@@ -108,15 +124,20 @@ WALL = WallNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Vessel(Value):
-    """An open vessel with a vertical axis; lengths in metres."""
+    """An open vessel with a vertical axis, such as a cup, found in a cloud of n points. The frame
+    is that of the cloud.
 
-    center: Float[Tensor, "2"]  # position (x, y) of the axis [m]
-    # thickness of the wall [m]: mean of the fitted and the usual one, weighted by certainty
+    Its outer and inner wall meet at the rim, around the mouth.
+    """
+
+    center: Float[Tensor, "2"]  # position (x, y) [m] of the axis
+    # thickness [m] of the wall: mean of the fitted and the usual one, weighted by certainty
     thickness: float
-    radius: float  # outer radius of the mouth
-    rim: float  # height of the mouth
-    inner: Bool[Tensor, "n"]  # mask of the points seen through the mouth
-    body: Bool[Tensor, "n"]  # mask of the points on either wall, without handles, rim and floor
+    radius: float  # outer radius [m] of the mouth
+    rim: float  # height [m] of the mouth, along z
+    inner: Bool[Tensor, "n"]  # mask of the cloud's points that were seen through the mouth
+    # mask of the cloud's points on either wall, without handles, rim and floor
+    body: Bool[Tensor, "n"]
 
 
 def find_vessel(
@@ -193,24 +214,26 @@ def find_vessel(
 
 @dataclasses.dataclass(frozen=True)
 class HiddenWall(Batch):
-    """Estimated points of a wall that the camera did not see.
+    """Estimated points of the part of a vessel's wall that the camera did not see.
 
-    The columns of `shared` are the errors [m] along the normals that four causes make, at one
-    standard deviation each. The causes are the axis position (two columns), the wall's thickness
-    and the floor's height.
+    A vessel has an outer and an inner wall about a vertical axis. Four errors move the points along
+    their normals. They are those of the axis (x and y), of the wall's thickness, and of the floor's
+    height.
     """
 
-    points: Float[Tensor, "m 3"]  # hidden points of the wall [m]
-    normals: Float[Tensor, "m 3"]  # outward unit normals
-    shared: Float[Tensor, "m 4"]  # errors of the points by four common causes [m]
+    # hidden points [m] of the wall, in the frame of the vessel's cloud
+    points: Float[Tensor, "m 3"]
+    normals: Float[Tensor, "m 3"]  # unit normals at these points, away from the material
+    # errors [m] of the points, one column for each cause at one standard deviation of it
+    shared: Float[Tensor, "m 4"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Wall(Value):
-    """One wall of a vessel, seen and hidden."""
+    """One wall of an open vessel, the outer or the inner one."""
 
-    seen: Bool[Tensor, "n"]  # mask of the cloud's points on the wall
-    hidden: HiddenWall  # estimated points of it
+    seen: Bool[Tensor, "n"]  # mask of the cloud's n points that lie on this wall
+    hidden: HiddenWall  # estimated points of the part that the camera did not see
 
 
 def complete_walls(
@@ -259,7 +282,7 @@ def complete_walls(
 
 
 def lid(vessel: Vessel) -> HiddenWall:
-    """Return points on an imagined flat lid, which closes the outer surface at the rim."""
+    """Return points on an imagined flat lid that closes a vessel's outer surface at its rim."""
     return _disc(vessel, vessel.rim, vessel.radius, WALL.lid_rings)
 
 
