@@ -241,7 +241,6 @@ def complete_walls(
     vessel: Vessel,
     outline: Outlines,
     table: float,
-    numbers: WallNumbers = WALL,
 ) -> tuple[Wall, Wall]:
     """Return (outer, inner): the two walls of a vessel on a table, each seen and hidden.
 
@@ -250,7 +249,6 @@ def complete_walls(
         vessel: the vessel that it shows.
         outline: silhouettes of the views.
         table: the table's height [m].
-        numbers: errors of the hidden parts, and bounds on their numbers of points.
 
     The other side of a seen wall is one thickness away. Parts seen on neither side are estimated by
     rotating the seen parts about the axis.
@@ -262,20 +260,20 @@ def complete_walls(
     every = HiddenWall(points, normals, points.new_zeros(len(points), 4))
     outside = every[vessel.body & ~inner]
     inside = every[vessel.body & inner]
-    turned = _turn(outside, vessel, numbers)
+    turned = _turn(outside, vessel)
     outer_parts = [_across(inside, vessel), turned]
     inner_parts = [
         _across(outside, vessel),
-        _turn(inside, vessel, numbers),
+        _turn(inside, vessel),
         _across(turned, vessel),
     ]
-    seen_floor = inner & (normals[:, 2] > numbers.up)
-    if int(seen_floor.sum()) > numbers.floor_points:
+    seen_floor = inner & (normals[:, 2] > WALL.up)
+    if int(seen_floor.sum()) > WALL.floor_points:
         floor = float(points[seen_floor, 2].median())
     else:
         floor = table + vessel.thickness
         away = norm(points[inner, :2] - vessel.center)
-        inner_parts.append(_disc(vessel, floor, float(away.min()), numbers.floor_rings))
+        inner_parts.append(_disc(vessel, floor, float(away.min()), WALL.floor_rings))
     outer_hidden = _merge(points[~inner], outline, outer_parts, vessel, table)
     inner_hidden = _merge(points[inner], outline, inner_parts, vessel, floor)
     return Wall(~inner, outer_hidden), Wall(inner, inner_hidden)
@@ -295,17 +293,17 @@ def _across(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
     return HiddenWall(wall.points - vessel.thickness * wall.normals, -wall.normals, shared)
 
 
-def _turn(wall: HiddenWall, vessel: Vessel, numbers: WallNumbers) -> HiddenWall:
+def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
     """Return some points of a wall, rotated about the axis by parts of a full circle. Return also
     the errors of the axis position.
     """
-    wall = wall[pick_apart(wall.points, numbers.turned)]
-    turn = rotations_about_z(numbers.turns)  # (k, 3, 3)
+    wall = wall[pick_apart(wall.points, WALL.turned)]
+    turn = rotations_about_z(WALL.turns)  # (k, 3, 3)
     axis = torch.cat([vessel.center, turn.new_zeros(1)])
     points = (wall.points - axis) @ turn.mT + axis  # (k, m, 3)
     normals = wall.normals @ turn.mT
     # how points move with the axis
-    moved = numbers.center * (torch.eye(3).to(turn) - turn)[:, None]
+    moved = WALL.center * (torch.eye(3).to(turn) - turn)[:, None]
     shared = wall.shared.expand(len(turn), -1, -1).clone()
     shared[..., :2] += (normals[..., None, :] @ moved)[..., 0, :2]
     return HiddenWall(points.flatten(0, 1), normals.flatten(0, 1), shared.flatten(0, 1))
