@@ -93,7 +93,8 @@ def test_the_told_table_is_read_in_the_reference_while_the_simulators_is_true(tr
     assert_same_plane(
         driver(table=true).reference.table, Plane.horizontal(0.0).moved(hand_from_obj)
     )
-    assert driver(WRONG, TrialSpec(table=False), table=true).reference.table is None
+    with pytest.raises(BadArgument, match="told: expected None, got a table, for a trial without"):
+        driver(WRONG, TrialSpec(table=False), table=true)
 
 
 def test_a_controller_that_was_told_no_table_knows_none():

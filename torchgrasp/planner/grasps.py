@@ -150,8 +150,7 @@ def plan_grasps(
         BadArgument: an object of no graspable size; no target; a camera that cannot have seen it.
         BadArgument: a table above most points or a camera, or over 2 m below the top; `keep` off
             the object; an `arm` of another hand; a `promise` with `GraspTask.displaced`.
-        BadArgument: `shape`, `arm`, `observer`, `reachable`, a region or a table with an edge
-            beside several clouds.
+        BadArgument: several clouds with `shape`, `arm`, `observer`, `reachable`, region or edge.
         MissingExtra, NoWorkers: pebble or numba is not installed, or no worker process can start.
 
     If cloud, camera and table are moved together, the grasps move with them. In a scene the hand

@@ -57,7 +57,7 @@ def run() -> Run:
         pose,
         contacts,
         order,
-        small,
+        0.2 + small,  # the hand is beside the ball
         0.004 * one,
         math.pi * small,
         certificate,

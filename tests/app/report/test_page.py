@@ -93,7 +93,7 @@ def test_a_page_into_a_file_as_folder_is_refused(run, tmp_path, monkeypatch, wri
 
 def test_grasp_rows_are_in_millimetres_and_degrees(run):
     (row,) = grasp_rows(run.executable)
-    assert row == ("1", "73%", "1.00", "4.0", "0", "0.0200", "1.0")
+    assert row == ("1", "73%", "201.00", "4.0", "0", "0.0200", "1.0")
 
 
 def test_verdicts(run):
