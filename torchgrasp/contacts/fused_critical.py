@@ -159,13 +159,17 @@ def _softened(soft, beta, mu, z):
 @inlined
 def _write_equations(held, cones, at, scaling):
     """Write the equations of the unknowns, as the first half of `_Cones.directions`."""
-    mu, system = at.unknowns[7], scaling.system
+    mu = at.unknowns[7]
+    system = scaling.system
     bent = 0.0
     pressing = 0.0
     for i in range(len(at.forces)):
-        push, rows = at.forces[i, 0], cones.rows[i]
-        x, s = scaling.cones[0, i], scaling.cones[1, i]
-        size_x, size_s = math.sqrt(scaling.form[0, i]), math.sqrt(scaling.form[1, i])
+        push = at.forces[i, 0]
+        rows = cones.rows[i]
+        x = scaling.cones[0, i]
+        s = scaling.cones[1, i]
+        size_x = math.sqrt(scaling.form[0, i])
+        size_s = math.sqrt(scaling.form[1, i])
         beta = size_x / size_s
         gain = 1.0 + dot(x, s) / (size_x * size_s)
         point = add(scale(x, 1.0 / size_x), _flipped(s), 1.0 / size_s)
@@ -246,7 +250,8 @@ def _longest(scaling, changes):
     nearest = 0.0
     for c in range(2):
         for i in range(changes.forces.shape[1]):
-            form, change = scaling.form[c, i], changes.cones[0, c, i]
+            form = scaling.form[c, i]
+            change = changes.cones[0, c, i]
             along = dot(_flipped(scaling.cones[c, i]), change)
             bend = dot(_flipped(change), change)
             root = math.sqrt(max(along * along - form * bend, 0.0))
