@@ -227,11 +227,11 @@ def check_foot(cloud: PointCloud, table: Plane) -> None:
 
 
 def warn_of_low_table(cloud: PointCloud, table: Plane) -> None:
-    """Warn (`NoEffect`) of a table that is farther below its object's points than the points
-    extend.
+    """Warn (`NoEffect`) if the gap between a table and the points above it is larger than the
+    diagonal of the points' bounding box.
 
-    Such an object counts as in the air, as without a table. The space hidden behind its points
-    reaches no farther than their extent. The table is in the frame of the cloud.
+    The object then counts as in the air, as without a table: what the points hide is assumed to
+    reach no farther than this diagonal. The table is in the frame of the cloud.
     """
     points = cloud.points.double().cpu()
     foot = float(table.height(points).quantile(AGREEMENT.lowest))

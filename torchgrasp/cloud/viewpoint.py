@@ -98,12 +98,19 @@ def guess_viewpoint(
     """Return a camera position [m] that explains a view, and the angle [deg] of its uncertainty.
 
     The camera is likely within this angle; 180 degrees means that the points hardly show the
-    direction. `points` are (n, 3) [m]; `normals` (n, 3) are unit vectors of either sign. Of all
-    directions above the support, the one that explains the points best is taken. The camera is
-    placed along it, 4 radii of the cloud away. The direction `up` is above the support; the normal
-    of a support in the points replaces it. Before this search, the origin is tried. It is returned
-    if the points lie before it along z and a camera there can have seen them. With an `up` that is
-    given and not only `assumed`, it is tried only for points below the origin.
+    direction.
+
+    First the origin is tried. It is returned if the points lie before it along z, and a camera
+    there can have seen them. If `up` is known, the points must also lie below the origin. Else the
+    direction is searched: of all directions above the support, the one that explains the points
+    best. The camera is placed along it, 4 radii of the cloud away.
+
+    Args:
+        points: the points (n, 3) [m].
+        normals: their unit normals (n, 3), of either sign.
+        up: unit vector (3,) that points away from the support. If the points show a support, its
+            normal replaces `up` in the search. None means unknown.
+        assumed: whether `up` is only a guess, and so not known.
     """
     points, normals = _draw(points, normals)
     centre, radius = _enclose(points)

@@ -111,7 +111,7 @@ def drag_object(
         mesh: the true object [m], closed, in the frame of the plan: a trimesh, a file, or a
             `GraspObject`.
         spec: parameters of the trial. None means a table with a friction of 0.3, as planned by
-            default: `TrialSpec(table_friction=0.3)`. The closing is not used.
+            default: `TrialSpec(table_friction=0.3)`. Its closing mode has no effect on a drag.
         seed: seed of the sensors' noise, and of friction and mass if the `spec` has distributions
             of them.
         parts: convex parts [m] of the mesh. None means those of a `GraspObject`, or those that
@@ -119,8 +119,8 @@ def drag_object(
         table: the true table, with its edge. None means that of the plan.
 
     Raises:
-        BadArgument: a plan that `DragController` refuses, or a mesh that does not stand on the
-            table.
+        BadArgument: a plan of another hand, without a pressing finger or without a displacement.
+        BadArgument: a mesh that does not stand on the table.
         BadArgument: a sensor that measures no force, at all or at a finger that presses.
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.

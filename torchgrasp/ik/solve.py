@@ -43,11 +43,11 @@ class SolveNumbers:
     library_seeds: int = 8
     """Number of initial guesses for a contact set that are taken from the library of postures."""
     learned_seeds: int = 2
-    """Number of initial guesses from the learned model for a reachable assignment of contacts to
-    fingers. They are the mean and one component.
+    """Number of initial guesses from the learned model for each reachable assignment of contacts to
+    fingers. They are the mean of its prediction, and that of one of its Gaussians.
     """
     learned_tries: int = 4
-    """Number of initial guesses from the learned model for a contact set that are refined."""
+    """Number of these guesses, over all assignments of a contact set, that are refined."""
     part: int = 512
     """Number of initial guesses refined at a time: their temporaries stay in the cache."""
 

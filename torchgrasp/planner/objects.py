@@ -368,9 +368,10 @@ class Objects:
 
 
 def pose_request(request: Request, hand: Hand) -> Objects:
-    """Return the one object of a request in its upright frame, prepared for a hand.
+    """Return the one object of a request in its upright frame, ready to be planned for a hand.
 
-    `pose` adds the `hand`, the constraints, the initial guesses and the obstacles.
+    All three steps are taken: seen, shaped and posed. The last, `pose`, adds the `hand`, the
+    constraints, the initial guesses and the obstacles.
     """
     model = find_model(request)  # first, so that a missing model is told before any work
     return pose(ShapedObject.of(request), request, hand, model)

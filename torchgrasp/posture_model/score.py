@@ -87,8 +87,9 @@ class MixtureScore(Value):
 
 
 def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScore:
-    """Return the errors of a model on held-out postures, which are `samples` of the same hand.
+    """Return how far the joints that a model predicts for contact codes are from the true ones.
 
+    `samples` are postures of the same hand, with their codes, that the model was not trained on.
     Raises `BadArgument` for fewer than two postures, or for other joints than the model's.
     """
     if samples.joint_names != mixture.joint_names:

@@ -57,14 +57,16 @@ class SceneNumbers:
     touch: float = 0.01
     """Largest distance [m] of a given point from a measured one."""
     part: float = 0.1
-    """Least share of an object's pixels beyond a crease that may be another object."""
+    """Least share of an object's pixels beyond a crease at which a note says that they may be
+    another object.
+    """
     apart: float = 0.2
-    """Least share of an object's pixels before or behind a jump of depth that may be another
-    object.
+    """Least share of an object's pixels before or behind a jump of depth at which a note says that
+    they may be another object.
     """
     across: float = 0.19
-    """Distance [m] between a target's two farthest points from which on it may be several objects.
-    Hands grasp few that are longer.
+    """Distance [m] between a target's two farthest points from which on a note says that it may be
+    several objects. Hands grasp few objects that are longer.
     """
     filled: float = 0.85
     """Share of the convex hull of its pixels that such a target fills, below which it may be
@@ -88,8 +90,8 @@ class SceneNumbers:
     fifth of the target is usually hidden.
     """
     afloat: float = 0.15
-    """Greatest distance [m] of a target's foot from its table without a note: things in front of
-    the target hide less.
+    """Height [m] of a target's foot above its table from which on a note is given. Things in front
+    of a target seldom hide so much of it.
     """
 
 

@@ -84,8 +84,8 @@ class Posterior(Value):
 
     @kept
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
-        """The matrix L^-T (r, r), where L is the Cholesky factor `factor`, as a list of blocks of
-        columns.
+        """The matrix L^-T (r, r) as a list of blocks of columns. L (`factor`) is the Cholesky factor
+        of the covariance of the r observed numbers with their noise.
 
         The block of the columns i to j - 1 holds the rows 0 to j - 1. The rows below are zero.
         """

@@ -74,12 +74,12 @@ class DraftNumbers:
     damping: float = 0.03  # least ratio of damping to stiffness of a drive: its time constant [s]
     # number of random postures of each set of fingers in which one without collision is sought
     trials: int = 1000
-    # Share of postures without self-collision below which pairs of links that collide often are no
-    # longer tested. Their shapes are too coarse: real fingers seldom meet.
+    # If fewer postures than this share are free of self-collision, pairs of links that collide often
+    # are no longer tested. Their shapes are too coarse: real fingers seldom meet.
     least_free: float = 0.02
-    # least share of postures in which such a pair of links of one finger collides
+    # two links of one finger collide often if they do in this share of the postures or more
     most_within: float = 0.25
-    # least share of postures in which such a pair of other links collides
+    # the same for two other links
     most_between: float = 0.5
     listed: int = 5  # greatest number of pairs of links that a warning names
     thin: float = 6e-3  # thickness [m] of a link below which it may be no fingertip

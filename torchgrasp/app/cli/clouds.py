@@ -238,7 +238,8 @@ class ShapeSurface(Command):
     )
     view: inputs.CloudOptions = nested(inputs.CloudOptions())
     support: Literal["camera", "paper"] = option(
-        "camera", "observations of the hidden side: from the camera, or the paper's points"
+        "camera",
+        "what stands in for the unseen side: an estimate of it, or the paper's distant points",
     )
     resolution: int = option(64, "cells along the diameter of the surface's domain, 8 to 256")
     seed: Seed = option(0, inputs.SEED_HELP)
