@@ -51,6 +51,8 @@ class MaskNumbers:
     """Share of the image in a mask above which the mask is perhaps inverted."""
     told: float = 0.05
     """Share of a mask's pixels above which their removal is mentioned in a note."""
+    thin: float = 0.05
+    """Share of a label's pixels at jumps of depth above which its object is a thin bar."""
     reach: float = 0.04
     """Greatest shift of a mask that is tried, as a share of the width of the image. Colour and
     depth that are not aligned differ by 2 % or so.
@@ -391,7 +393,7 @@ def _on_objects(view: TableImage, labels: Int[Tensor, "h w"]) -> Bool[Tensor, "h
     beside = at_one_jump(view) & ~sure
     names, own = labels.unique(return_inverse=True)
     more = count_labels(own[beside], len(names))
-    thin = more > MASKS.told * (more + count_labels(own[sure], len(names)))
+    thin = more > MASKS.thin * (more + count_labels(own[sure], len(names)))
     return sure | (thin[own] & beside)
 
 
