@@ -130,7 +130,10 @@ def test_the_command_closes_the_hand_and_writes_a_gif(run_command, tmp_path, mon
     [
         (["--out", "lift.avi"], "--out: expected a file that ends in .gif or .mp4"),
         (["--out", "lift.gif"], "--mesh: expected a mesh where"),
-        (["--out", "lift.gif", "--number", "7"], "--number: expected one of the 1 executable"),
+        (
+            ["--out", "lift.gif", "--rank", "7"],
+            "--rank: expected at most 1, the number of executable",
+        ),
         (["--out", "lift.gif", "--rate", "99"], "--rate: expected a whole number in [1, 50]"),
     ],
 )

@@ -41,8 +41,8 @@ class Film(Command):
         "closed mesh of the object [m], in the frame of the grasps; by default the estimated "
         "surface.ply of GRASPS",
     )
-    number: Annotated[int, Range(0, 10**6)] = option(
-        0, "which of the executable grasps, from 0, the best"
+    rank: Annotated[int, Range(1, 10**6)] = option(
+        1, "rank of the executable grasp, as `torchgrasp grasp` prints it; 1 is the best"
     )
     simulator: Simulator = option("sapien", "simulator; each needs its extra: sim, or mujoco")
     mass: float = option(0.25, "mass of the object [kg]")
@@ -60,15 +60,15 @@ class Film(Command):
         with naming(path="GRASPS"):
             planned = load_grasps(file)
         good = planned[planned.status == Status.OK]
-        if self.number >= len(good):
-            count = f"{len(good)} executable grasps, counted from 0"
-            raise BadArgument("--number", self.number, f"one of the {count}")
+        if self.rank > len(good):
+            allowed = f"at most {len(good)}, the number of executable grasps"
+            raise BadArgument("--rank", self.rank, allowed)
         mesh = file.with_name(SURFACE) if self.mesh is None else self.mesh
         if self.mesh is None and not mesh.is_file():
             raise BadArgument("--mesh", None, f"a mesh where {mesh} is missing")
         with naming(name_or_path="--hand"):
             hand = hand_of(good, self.hand)
-        grasp = good[self.number]
+        grasp = good[self.rank - 1]
         body, parts = read_true_mesh(mesh)
         table = table_under(body, grasp.table)
         spec = TrialSpec(mass=self.mass, friction=self.friction, simulator=self.simulator)
