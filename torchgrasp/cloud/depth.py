@@ -69,10 +69,6 @@ class DepthNumbers:
     """Number of points, about, by which a table in the view is compared with the pose."""
     whole: float = 0.5
     """Least share of the measured pixels in a mask without much around it."""
-    afloat: float = 0.15
-    """Greatest height [m] of the object in the mask above its table: what stands before it hides
-    less.
-    """
 
 
 DEPTH = DepthNumbers()
@@ -155,7 +151,7 @@ def cloud_from_depth(
         view = apply(pose, _points(z_image, k, seen, lens))
         view = view[:: 1 + len(view) // DEPTH.viewed].cpu()
         own = apply(pose, points)[:: 1 + len(points) // DEPTH.viewed].cpu()
-        target = Target(own, DEPTH.afloat)
+        target = Target(own)
         support = check_view(view, pose.cpu(), up, depth_unit is not None, target)
         if support is not None and up is None:
             notes += tell_tilt(pose.cpu(), support.plane)

@@ -32,7 +32,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector, turned_about
-from torchgrasp.geometry.linalg import UNIT_TOLERANCE, dot, norm
+from torchgrasp.geometry.linalg import check_unit_vectors, dot
 from torchgrasp.values.closing import ClosingOptions, choose_options
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import PointCloud
@@ -317,9 +317,8 @@ class GraspController:
             raise BadArgument("observation", told, f"those of the hand, {shape}")
         device = self._sent.joints.device
         check_device("observation", observation.joints.device, "the controller", device)
-        if (up := observation.up) is not None and abs(float(norm(up)) - 1) > UNIT_TOLERANCE:
-            found = f"a vector of length {float(norm(up)):g}"
-            raise BadArgument("observation.up", found, "a unit vector")
+        if observation.up is not None:
+            check_unit_vectors("observation.up", observation.up)
         # what is remembered must stay: a robot may read its sensors into the same memory
         observation = map_tensors(torch.clone, observation)
         if self.guard is not None:

@@ -17,7 +17,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Force, Positive, check_dense, is_known
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.geometry.linalg import UNIT_TOLERANCE, dot, norm
+from torchgrasp.geometry.linalg import check_unit_vectors, dot, norm
 from torchgrasp.hand.drives import joint_stiffness
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps
@@ -193,10 +193,7 @@ def _check_reached(hand: Hand, grasps: Grasps) -> None:
     pads, _ = hand.fingertips(grasps.joints)
     centres = hand.tip_centres(grasps.joints)
     rolled = points + hand.tips.radius[:, None] * normals
-    lengths = norm(normals)
-    if bool(((lengths - 1).abs() > UNIT_TOLERANCE).any()):
-        found = f"vectors of length {float(lengths.min()):g} to {float(lengths.max()):g}"
-        raise BadArgument("grasps.contacts.normals", found, "unit vectors")
+    check_unit_vectors("grasps.contacts.normals", normals)
     behind = dot(centres - points, normals) < 0
     good = grasps.status == Status.OK
     if bool(behind[good].all(-1).any()):

@@ -19,7 +19,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, Force, Pose, Positive, Range
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.geometry.linalg import UNIT_TOLERANCE, norm, unit
+from torchgrasp.geometry.linalg import check_unit_vectors, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.drives import drive_stiffness, joint_stiffness
@@ -288,12 +288,9 @@ def check_plan(reference: ClosingReference) -> None:
     if len(reference.kp) != joints or not bool((reference.kp > 0).all()):
         found = f"{len(reference.kp)} stiffnesses from {float(reference.kp.min()):g}"
         raise BadArgument("reference.kp", found, f"{joints} positive ones, of all joints")
-    lengths = {"reference.normals": norm(reference.normals)}
+    check_unit_vectors("reference.normals", reference.normals)
     if reference.approach is not None:
-        lengths["reference.approach"] = norm(reference.approach)[None]
-    for name, length in lengths.items():
-        if bool(((length - 1).abs() > UNIT_TOLERANCE).any()):
-            raise BadArgument(name, f"lengths {length.tolist()}", "unit vectors")
+        check_unit_vectors("reference.approach", reference.approach)
     points = reference.gains.target
     if reference.table is not None and reference.planned_table is not None:
         table = reference.table

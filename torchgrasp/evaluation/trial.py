@@ -313,10 +313,15 @@ def derive_reference(
     plan = ClosingReference.from_grasp(hand, grasp, force, kp, preference)
     table = table and table.moved(inverse(grasp.obj_from_hand[0]))
     sensor = sensor or plan.sensor
-    known = {"table": table, "surface": surface, "sensor": sensor, "max_force": max_force}
-    # trials also tell tables that are wrong, and grasps that were moved into another frame
-    known["planned_table"] = None
-    return dataclasses.replace(plan, **known)
+    return dataclasses.replace(
+        plan,
+        table=table,
+        # trials also tell tables that are wrong, and grasps that were moved into another frame
+        planned_table=None,
+        surface=surface,
+        sensor=sensor,
+        max_force=max_force,
+    )
 
 
 class TrialRun:

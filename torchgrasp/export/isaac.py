@@ -118,8 +118,9 @@ def format_isaac(
     poses = grasps.obj_from_hand.double()
     if flange is not None:
         frame = gripper_link or FLANGE
-        _check_flange(hand, grasps, frame, check_flange(flange))
-        poses = poses @ check_flange(flange)
+        flange = check_flange(flange)
+        _check_flange(hand, grasps, frame, flange)
+        poses = poses @ flange
     else:
         frame = gripper_link or root
         poses = poses @ _root_from_link(hand, grasps, frame.rpartition("/")[2])

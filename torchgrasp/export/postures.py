@@ -19,7 +19,7 @@ from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Force, Pose, Positive
 from torchgrasp.geometry.frames import rotate
-from torchgrasp.geometry.linalg import UNIT_TOLERANCE, norm
+from torchgrasp.geometry.linalg import check_unit_vectors, norm
 from torchgrasp.hand.drives import stiff_drives
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
@@ -176,10 +176,7 @@ def _check_executable(hand: Hand, grasps: Grasps) -> None:
     limits = hand.to(torch.float64).actuated
     limits.check_limits(grasps.joints.double(), "grasps.joints")
     limits.check_limits(grasps.pregrasp.double(), "grasps.pregrasp")
-    off = (norm(grasps.approach.double()) - 1).abs()
-    if bool((off > UNIT_TOLERANCE).any()):
-        found = f"vectors up to {1 + float(off.max()):g} long"
-        raise BadArgument("grasps.approach", found, "unit vectors")
+    check_unit_vectors("grasps.approach", grasps.approach.double())
 
 
 def check_flange(flange: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:

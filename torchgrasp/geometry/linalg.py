@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from torchgrasp.foundation.errors import IndefiniteCovariance
+from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.foundation.fused import is_fused
 from torchgrasp.foundation.lazy import sparse
 from torchgrasp.foundation.rules import is_known
@@ -31,6 +31,18 @@ def norm(v: Float[Tensor, "*b d"], keepdim: bool = False) -> Float[Tensor, "*c"]
     size 1.
     """
     return torch.linalg.vector_norm(v, dim=-1, keepdim=keepdim)
+
+
+def check_unit_vectors(name: str, vectors: Float[Tensor, "*b d"]) -> None:
+    """Raise `BadArgument` if the length of a vector differs from 1 by more than 0.001
+    (`UNIT_TOLERANCE`). The error calls the vectors `name`. NaN is accepted.
+    """
+    length = norm(vectors).flatten()
+    off = (length - 1).abs().nan_to_num(0.0, posinf=torch.inf)
+    if bool((off > UNIT_TOLERANCE).any()):
+        raise BadArgument(
+            name, f"a vector of length {float(length[off.argmax()]):.6g}", "unit vectors"
+        )
 
 
 def dot(

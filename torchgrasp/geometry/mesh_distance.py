@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.fused import is_fused
+from torchgrasp.foundation.fused import are_on
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.box_tree import Boxes, sort_into_boxes
 from torchgrasp.geometry.linalg import number_rows
@@ -111,7 +111,7 @@ class MeshSurface:
         """
         samples = self.few if far else self.every
         tried = 1 if far else min(MESH_DISTANCE.tried, len(self.owner))
-        if is_fused():
+        if are_on():
             from torchgrasp.geometry import fused_distance  # it imports numba
 
             return fused_distance.distance(points, samples, self, tried)

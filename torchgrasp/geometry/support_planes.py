@@ -74,6 +74,10 @@ class SupportNumbers:
     """Share of a target's points that may be lower than its foot."""
     foot: float = 0.03
     """Greatest depth [m] of a target's foot below its support: masks are a little too large."""
+    afloat: float = 0.15
+    """Height [m] of a target's foot above a plane from which on the plane is not its support. Things
+    in front of a target seldom hide so much of it.
+    """
     overhang: float = 0.05
     """Greatest distance [m] of a target's points beside the region of its support."""
     over: float = 0.5

@@ -34,19 +34,17 @@ class Target:
     """An object that is to be grasped, whose support is sought: some of its points."""
 
     points: Points  # points (n, 3) [m] of the object
-    # greatest height [m] of its lowest points (its foot) above the plane of its support
-    reach: float
 
     def stands_on(self, support: SupportPlane) -> bool:
         """Return whether the object is over the region of a support, with its foot near the plane.
 
-        More than half of its points are then over the region. Its foot is at most `reach` [m] above
-        the plane, or 30 mm (`SUPPORTS.foot`) below it.
+        More than half of its points are then over the region. Its foot is less than 0.15 m
+        (`SUPPORTS.afloat`) above the plane, or 30 mm (`SUPPORTS.foot`) below it.
         """
         height = support.plane.height(self.points)
         foot = float(height.quantile(SUPPORTS.outliers))
         over = support.covers(self.points, SUPPORTS.overhang).double().mean()
-        return -SUPPORTS.foot < foot < self.reach and float(over) > SUPPORTS.over
+        return -SUPPORTS.foot < foot < SUPPORTS.afloat and float(over) > SUPPORTS.over
 
 
 def find_table(

@@ -11,7 +11,7 @@ from torchgrasp.cloud.agreement import check_where
 from torchgrasp.contacts.region import Region, combine
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.fused import is_fused
+from torchgrasp.foundation.fused import are_on
 from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
@@ -93,7 +93,7 @@ class Request:
         object, or one to keep to holds all of it. Raises `MissingExtra` if compiled loops are asked
         for without numba.
         """
-        is_fused()
+        are_on()
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
             raise BadArgument(
                 "arm",

@@ -27,7 +27,7 @@ from torchgrasp.foundation.rules import Pose, Positive
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import Points, norm
 from torchgrasp.geometry.plane import Plane, to_upright
-from torchgrasp.geometry.support_planes import SupportPlane
+from torchgrasp.geometry.support_planes import SUPPORTS, SupportPlane
 from torchgrasp.geometry.support_search import Target, find_table
 from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import (
@@ -88,10 +88,6 @@ class SceneNumbers:
     covered: float = 0.2
     """Share of the target's outline that one object covers, above which advice names it. Then a
     fifth of the target is usually hidden.
-    """
-    afloat: float = 0.15
-    """Height [m] of a target's foot above its table from which on a note is given. Things in front
-    of a target seldom hide so much of it.
     """
 
 
@@ -351,7 +347,7 @@ class Scene(Value):
             return ()
         height = self.table.height(self.points[self.rows_of()].double())
         foot = float(height.quantile(SCENE.lowest))
-        if foot <= SCENE.afloat:
+        if foot <= SUPPORTS.afloat:
             return ()
         where = f"the target begins {foot:.2f} m from the plane that is taken for its table"
         return (f"{where}, which may be a floor or a wall: give the table",)
@@ -669,4 +665,4 @@ def _target(points: Points, inside: Tensor | None) -> Target | None:
     if inside is None or not bool(inside.any()):
         return None
     own = points[inside]
-    return Target(own[:: 1 + len(own) // SCENE.drawn], SCENE.afloat)
+    return Target(own[:: 1 + len(own) // SCENE.drawn])
