@@ -38,8 +38,8 @@ class CampaignSpec(Value):
 
     Args:
         protocol: the protocol by which each grasp is tried in simulation, or its name in
-            `torchgrasp.evaluation.PROTOCOLS`. An unknown name raises `BadArgument` in `test` and in
-            `run_campaign`, not here.
+            `torchgrasp.evaluation.PROTOCOLS`. An unknown name raises `BadArgument` in the property
+            `test` and in `run_campaign`, not here.
         trials: which views are planned on, and how many of their grasps are tried
             (`torchgrasp.evaluation.EvaluationSpec`).
         licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".

@@ -45,7 +45,7 @@ class ViewDistanceNumbers:
     least: int = 20
     """Least number of compared points: fewer are a rim of flying pixels."""
     seen: float = 0.9
-    """Quantile of the heights of points in front of a surface that counts as their height. Flying
+    """How high a view stands in front of a surface is this quantile of its points' heights. Flying
     pixels are higher.
     """
     same: float = 0.8
@@ -55,17 +55,19 @@ class ViewDistanceNumbers:
     greater one are refused.
     """
     shifted: float = 3.0
-    """Greatest shift of a view, or height of a view before what another camera saw, in multiples of
-    their noise.
+    """Greatest shift of a view, in multiples of the noise. It also bounds how high a view stands in
+    front of the surface that another camera saw.
     """
     likely: float = 1.0
-    """Chi squared of a motion from which on it widens the standard deviations of the poses."""
+    """Chi squared of a motion above which the motion adds to the standard deviations of poses."""
     shown: float = 4.0
-    """Chi squared of a motion from which on it is reported, corrected or refused. Below it, noise
-    and bias of the cameras explain the motion.
+    """Chi squared above which a motion is reported, corrected or refused. Below it, noise and bias
+    of the cameras explain the motion.
     """
     vague: float = 1.5
-    """Factor on the limits for a view without a camera, whose noise is a guess."""
+    """Factor on the limits `refused` and `shifted` for a view without a camera. Its noise is a
+    guess.
+    """
     meet: float = 0.05
     """Least share of a view's points that must lie on the other view, or behind it."""
     gap: float = 0.03

@@ -322,8 +322,9 @@ def drawn_contacts(lines: LinePosterior, n: int, seed: int) -> tuple[TouchPoints
     """Return points (normalised) and outward unit normals at which fingertips touch n random
     surfaces.
 
-    The surfaces are drawn with a `seed` from the Gaussian `lines`. Both results have the shape (b,
-    n, f, 3), and are NaN where a line meets no surface.
+    `lines` is the Gaussian of the surface along the normal lines of b sets of f contacts. The
+    surfaces are drawn from it with a `seed`. Both results have the shape (b, n, f, 3). They are NaN
+    where a line meets no surface.
     """
     # the draws are the same for all that torch.vmap maps over
     with torch._C._DisableFuncTorch():

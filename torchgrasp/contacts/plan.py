@@ -94,9 +94,10 @@ def plan_contacts(
 
 
 def stages_for(spec: ContactSpec) -> tuple[Stage, ...]:
-    """Return the solver stages for random initial guesses under the constraints `spec`.
+    """Return the solver's stages (weights and numbers of steps) for random initial guesses.
 
-    They depend on whether the surface at contacts must be flat.
+    If `spec` demands a flat surface at contacts, one short stage does. Otherwise the stages are
+    those of a full search, as from any guess.
     """
     return SEARCH if spec.flatness is None else TO_CENTRE
 

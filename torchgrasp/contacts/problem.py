@@ -69,14 +69,15 @@ class ShapeLike(Protocol):
     @property
     def domain_radius(self) -> PerRow:
         """The radius, normalised, of the ball about the normalised origin in which the shape is
-        known: a number, or (b,) as for `scale`. One normalised unit is `scale` [m].
+        known: a number, or for a batch of shapes one for each (b,). One normalised unit is `scale`
+        [m].
         """
         ...
 
     @property
     def std_factor(self) -> PerRow:
         """The factor (no unit) on the posterior's standard deviations that gives those of the true
-        surface. It is a number, or (b,) as for `scale`.
+        surface. It is a number, or for a batch of shapes one for each (b,).
         """
         ...
 

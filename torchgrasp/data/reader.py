@@ -58,7 +58,8 @@ class GraspShards:
     * `approach` (3,), the unit direction of the approach, and the pose `obj_from_hand` (4, 4) [m].
     * `contacts` (f, 3) [m], with the outward unit `normals` (f, 3) and the standard deviation
       `std_m` (f,) [m] of the surface there.
-    * `margin`, a number, and `witness` (6,) of the `Certificate`.
+    * `margin`, a number: the margin of the contacts' force closure, positive if they have it.
+    * `witness` (6,), a unit wrench that proves the margin (`Certificate`).
     * `clearance` [m], the least distance of links from surface, table and each other (`Grasps`).
     * `predicted`, the predicted success in [0, 1]; NaN where no trial supports it.
     * `simulated`, the share in [0, 1] of the grasp's simulated trials that passed, by the protocol

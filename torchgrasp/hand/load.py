@@ -125,7 +125,9 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
         hand: the hand.
         fingers: the grasping fingers, as in `load_hand`: an option's name, a number, or names.
 
-    Raises the errors of `load_hand`.
+    Raises:
+        HandFileError: a file is missing or malformed, or the two files contradict each other.
+        BadArgument: the hand has no such fingers.
 
     >>> with_fingers(load_hand("allegro"), 4).finger_names
     ('index', 'middle', 'ring', 'thumb')
@@ -141,10 +143,12 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
     Args:
         grasps: grasps of `plan_grasps`, or loaded from a file. Their `meta` names hand and fingers.
         hand: the same hand with any fingers, its name or its folder. None means the hand that
-            the grasps name: a shipped one, or a folder here.
+            the grasps name: a shipped one, or a folder in the working directory.
 
-    Raises the errors of `load_hand`. Raises `BadArgument` if the grasps name no hand, another hand,
-    or unknown fingers.
+    Raises:
+        HandFileError: a file of the hand is missing or malformed, or its files contradict each
+            other.
+        BadArgument: the grasps name no hand, another hand, or fingers that the hand lacks.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand_of(load_shipped_grasp("jug", "barrett")).name

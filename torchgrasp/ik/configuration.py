@@ -115,11 +115,11 @@ class SpatialJacobian(Value):
     def jacobian(
         self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]
     ) -> Float[Tensor, "g k d"]:
-        """Return the derivatives of k residuals by the d = 6 + h numbers of the hand's pose and
-        joints.
+        """Return the derivatives of k residuals of each configuration by the hand's pose (6) and
+        its h actuated joints (d = 6 + h).
 
-        `wrench` and `moves` are the fields of `ResidualRows`. They are derivatives by a translation
-        and a rotation, and 1 for each motion that counts.
+        `wrench` holds the residuals' derivatives by a translation [m] and a rotation [rad] about
+        the object's origin. `moves` is 1 where a motion changes a residual, else 0.
         """
         by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
         coupling = self.hand.motion.coupling

@@ -325,9 +325,10 @@ class Objects:
             self.request.observer(stage, message, self._moved(value))
 
     def give_back(self, grasps: Grasps) -> Grasps:
-        """Return grasps of a single object in the caller's frame, on the device of its cloud.
+        """Return grasps, given in the upright frame, in the caller's frame and on the device of its
+        cloud. The batch must hold a single object.
 
-        Their metadata name the frames, units and inputs of the plan.
+        The result's `meta` names the frames, units and inputs of the plan.
         """
         request = self.request
         spec = self.given_spec

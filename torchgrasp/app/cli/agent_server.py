@@ -232,11 +232,11 @@ class AgentServer:
 
 
 def do_work(tool: Tool, place: Workplace) -> Answer:
-    """Run a tool, and return its answer with the library's warnings among the notes.
+    """Run a tool, and return its answer, whose `notes` also hold the library's warnings.
 
-    It runs in a process of its own. `place` is the folder in which the tool reads and writes files.
-    Raises `GraspError`, also in place of an error that is no `GraspError`. The traceback of the
-    latter is written to stderr.
+    The server calls this function in a separate process. `place` is the folder in which the tool
+    reads and writes files. Raises the `GraspError` that ended the tool. An error of another type
+    becomes a `GraspError`, and its traceback is written to stderr.
     """
     with _stdout_elsewhere(), warnings.catch_warnings(record=True) as heard, naming(**NAMES):
         warnings.simplefilter("always", UserWarning)

@@ -22,9 +22,9 @@ FAR = 0.25  # an object this far from its first place [m] is lost, and is not fr
 
 
 def finite_ticks(closure: ClosureResult) -> Int[Tensor, " k"]:
-    """Return the indices (k,) of the control ticks with a known state.
+    """Return the indices (k,) of the control ticks with finite poses and joints.
 
-    In those of a diverged simulation a pose or a joint is NaN or infinite; they are left out.
+    Other ticks come from a diverged simulation.
     """
     poses = closure.object_pose.isfinite() & closure.hand_pose.isfinite()
     return flatnonzero(closure.joints.isfinite().all(-1) & poses.all(-1).all(-1))

@@ -192,7 +192,10 @@ class Silhouette(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Outlines(Value):
-    """The silhouettes of all views of one object, which lies within the outline of every view."""
+    """The silhouettes of all views of one object, which lies within the outline of every view.
+
+    All views, points and normals are in one frame: that of the cloud, until `moved`.
+    """
 
     views: tuple[Silhouette, ...]  # the silhouette of each view
 
