@@ -82,8 +82,9 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
     """Return a cloud without duplicate points, which would count as independent measurements.
 
-    Of coincident points the first is kept. Raises the errors of `check_cloud`, as for fewer than 4
-    distinct points or an extent outside [5 mm, 2 m].
+    Of coincident points the first is kept. Raises `TooFewPoints` for fewer than 4 distinct points,
+    and `SuspiciousScale` for an extent outside [5 mm, 2 m]. Other faults raise `BadArgument`
+    (`check_cloud`).
     """
     points = _check(cloud)
     rows = _distinct_rows(points)
@@ -103,8 +104,9 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
         voxel: side [m] of the voxels, 0.00001 to 1. Their grid starts at the cloud's least x, y and
             z.
 
-    Raises the errors of `check_cloud`, as for fewer than 4 distinct points or an extent outside [5
-    mm, 2 m]. Raises `TooFewPoints` if fewer than 4 voxels hold points.
+    Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
+    outside [5 mm, 2 m]. Other faults raise `BadArgument` (`check_cloud`). Raises `TooFewPoints` if
+    fewer than 4 voxels hold points.
 
     >>> len(voxel_downsample(PointCloud(0.1 * torch.rand(5000, 3)), 0.05)) <= 27
     True
@@ -129,8 +131,8 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
     Each point has a mean distance to its 8 nearest neighbours. The mean distance of an outlier is
     more than 2.5 times (`NEAR.outlier`) the median of all points.
 
-    Raises the errors of `check_cloud`, as for fewer than 4 distinct points or an extent outside [5
-    mm, 2 m].
+    Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
+    outside [5 mm, 2 m]. Other faults raise `BadArgument` (`check_cloud`).
 
     >>> points = torch.cat([0.1 * torch.rand(500, 3), torch.ones(1, 3)])
     >>> bool(remove_outliers(PointCloud(points)).points.max() < 0.2)

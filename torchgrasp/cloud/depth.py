@@ -68,7 +68,9 @@ class DepthNumbers:
     viewed: int = 5000
     """Number of points, about, by which a table in the view is compared with the pose."""
     whole: float = 0.5
-    """Least share of the measured pixels in a mask without much around it."""
+    """Share of the measured pixels in a mask, from which on the image shows little besides the
+    object.
+    """
 
 
 DEPTH = DepthNumbers()

@@ -136,8 +136,9 @@ def diagnose_cloud(
         stands: whether the object stands on a table. False means an object in the air, whose camera
             may be below it.
 
-    Raises the errors of `check_cloud`, as for fewer than 4 distinct points or an extent outside [5
-    mm, 2 m]. Raises `BadArgument` for a vector `up` of length zero.
+    Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
+    outside [5 mm, 2 m]. Other faults raise `BadArgument` (`check_cloud`). Raises `BadArgument` for
+    a vector `up` of length zero.
 
     >>> cloud = PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> diagnose_cloud(cloud).copies

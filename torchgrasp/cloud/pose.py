@@ -91,8 +91,8 @@ class PoseNumbers:
     tilt: float = 3.0
     """Greatest tilt of a table [deg] that needs no explanation."""
     level: float = 5.0
-    """Tilt of a table [deg] below which another pose, with which the table tilts so little, is
-    suggested. It must also tilt less than a third as much as now.
+    """Greatest tilt of a table [deg] under another pose at which that pose is suggested. The tilt
+    must also be less than a third of the present one.
     """
     told: float = 5.0
     """Least tilt of a table [deg] for a note."""
@@ -202,8 +202,8 @@ SIZES = SizeNumbers()
 def check_rigid(name: str, pose: Tensor) -> Transform:
     """Return the given pose if it is rigid to 1e-4, or the nearest rigid one within 0.1 degrees.
 
-    The latter, as of a file of three decimals, warns with `MendedInput`. Raises `BadArgument` for
-    another pose, with its fault. Messages call the argument `name`.
+    A pose that is replaced, such as one of three decimals, raises the warning `MendedInput`. Any
+    other pose raises `BadArgument`, which names its fault. Messages call the argument `name`.
     """
     if fix := FIXES.get(tuple(pose.shape)):
         raise BadArgument(name, f"shape {tuple(pose.shape)}", f"a 4 x 4 matrix: {fix}")

@@ -170,9 +170,10 @@ def prepare_cloud(
     is given for vectors across the surface, which are no normals, and for normals that point
     inward.
 
-    Raises the errors of `check_cloud`, as for fewer than 4 distinct points or an extent outside
-    [5 mm, 2 m]. Raises `BadArgument` for more than 16 cameras or normals that point away from the
-    camera. Raises `TooFewPoints` for a view of fewer than 10 points.
+    Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
+    outside [5 mm, 2 m]. Other faults raise `BadArgument` (`check_cloud`). Raises `BadArgument` for
+    more than 16 cameras or normals that point away from the camera. Raises `TooFewPoints` for a
+    view of fewer than 10 points.
     """
     distinct = remove_duplicates(cloud)
     if neighbours is None or len(distinct) < len(cloud):
@@ -254,8 +255,8 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
     It points towards the viewpoint. Without a viewpoint, it points to the side of the given normal.
     Without both, the viewpoint is estimated, and the result has this viewpoint.
 
-    Raises the errors of `check_cloud`, as for fewer than 4 distinct points or an extent outside [5
-    mm, 2 m].
+    Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
+    outside [5 mm, 2 m]. Other faults raise `BadArgument` (`check_cloud`).
 
     >>> cloud = PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))
     >>> estimate_normals(cloud).normals.shape
@@ -269,8 +270,9 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 def clean_cloud(cloud: PointCloud) -> PointCloud:
     """Return a cloud without duplicates and outliers, moved onto quadrics around the points.
 
-    Its normals are outward unit normals of the quadrics. Raises the errors of `check_cloud`, as for
-    fewer than 4 distinct points or an extent outside [5 mm, 2 m].
+    Its normals are outward unit normals of the quadrics. Raises `TooFewPoints` for fewer than 4
+    distinct points, and `SuspiciousScale` for an extent outside [5 mm, 2 m]. Other faults raise
+    `BadArgument` (`check_cloud`).
     """
     cloud = remove_duplicates(cloud)
     return _fit_normals(cloud, Neighbours(cloud.points.double()), clean=True)
@@ -400,8 +402,8 @@ def merge_clouds(
         BadArgument: views that contradict each other by more than about three times their noise. A
             pose is wrong, or the object moved.
 
-    The views and the result may raise the errors of `check_cloud`, as for an extent outside [5 mm,
-    2 m].
+    A view or the result that is no valid cloud raises an error (`check_cloud`), such as
+    `SuspiciousScale` for an extent outside [5 mm, 2 m].
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> len(merge_clouds([view, view], [torch.eye(4), torch.eye(4)]))

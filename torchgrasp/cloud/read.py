@@ -60,7 +60,9 @@ class ReadNumbers:
     is.
     """
     across: float = 0.1
-    """Quantile of the cosines with fitted planes that must be as large if all normals are alike."""
+    """Quantile of these cosines that must reach `fitted` in place of the median, if nearly all
+    normals are alike.
+    """
     searched: int = 1000
     """Number of rows, about, among which a point that stands for missing pixels is sought."""
     fewest: int = 100
@@ -240,7 +242,8 @@ def cloud_from_array(
             one position for each point: an array (n, 3), or (h, w, 3) for an image. None if it is
             unknown.
 
-    Raises the errors of `check_cloud`, such as `TooFewPoints` and `SuspiciousScale`. Raises
+    Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
+    outside [5 mm, 2 m]. Other faults of the cloud raise `BadArgument` (`check_cloud`). Raises
     `CloudFileError` for arrays of another shape or type.
 
     >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))

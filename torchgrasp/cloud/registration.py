@@ -97,7 +97,9 @@ class RegistrationNumbers:
     still: float = 1e-4
     """Greatest change [m, rad] of the motion in a step at which the search ends."""
     hidden: float = 0.9
-    """Greatest share that may be assumed of a motion's variance which the overlap does not show."""
+    """Greatest share of a motion's variance that is assumed to be hidden: the overlap does not show
+    it.
+    """
     gaussian: float = 1.4826
     """Ratio of the standard deviation to the median absolute value of a normal distribution."""
     shift: float = 0.05
@@ -152,10 +154,10 @@ def compare_views(views: Sequence[PointCloud]) -> list[float]:
     It is 0 for a view whose distance from the others is explained by noise, or is unknown.
 
     The views [m], with normals, are in one frame, each with at most one camera. Raises
-    `BadArgument` if two contradict each other beyond their noise, and names those that are farthest
-    apart, over their noise. Points of a view may not stand before a surface that the camera of
-    another saw. Views that nowhere meet are refused, too. A motion that noise does not explain
-    raises the warning `MendedInput`.
+    `BadArgument` if two views are farther apart than 2.5 to 3 times their noise, or nowhere meet.
+    It is also raised if points of a view stand before a surface that the camera of another view
+    saw. The error names the two views that are farthest apart relative to their noise. A motion
+    that noise does not explain raises the warning `MendedInput`.
     """
     surfaces = [_ViewSurface(view) for view in views]
     apart = list[tuple[float, float, float, tuple[int, int]]]()  # ratio, distance, limit, views
@@ -222,7 +224,8 @@ def _judge(distance: float, limit: float) -> tuple[float, float, float]:
 
 def align_views(views: Sequence[PointCloud]) -> list[tuple[Float[Tensor, "4 4"], float]]:
     """Return a motion new_from_old (4, 4) [m] of each view, after which the views agree best.
-    Return also its standard deviation [m] along the surface's normals.
+    Return also the standard deviation [m] of the motion along the surface's normals, as far as the
+    overlap does not show the motion.
 
     The views [m] have normals and are in one frame. The first stays. Each other one is moved onto
     the views that are already placed. A motion that noise does not explain raises the warning

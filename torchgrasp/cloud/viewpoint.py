@@ -33,7 +33,7 @@ class UnseenNumbers:
     """Least step of depth behind which points are hidden, over the radius of the cloud."""
 
     def excess(self, shares: tuple[float, float]) -> tuple[float, float]:
-        """Return the shares of points seen edge-on and hidden behind others, each over its
+        """Return the shares of points seen edge-on and hidden behind others, each divided by its
         bound.
         """
         return shares[0] / self.edge_on, shares[1] / self.behind
@@ -73,8 +73,8 @@ class GuessNumbers:
     sure: float = 1.0
     """Least score of a direction that the points show clearly."""
     better: float = 0.5
-    """Difference of score from the best camera position from which on a view was not taken from a
-    place.
+    """Greatest difference of a given camera's score from the best score, at which the view may be
+    from this camera.
     """
     tangent: float = 0.3
     """Cosine between ray and normal below which a surface counts less for the bulge, as noise turns

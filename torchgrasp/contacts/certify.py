@@ -237,9 +237,9 @@ def bound_margin(wrench: Wrenches, witness: Float[Tensor, "b 6"]) -> Float[Tenso
     """Return the upper bound of the closure margin that each direction `witness` in wrench space
     proves.
 
-    It is -min(g) / sum(g - min(g)), or NaN if all products g are 0. These are the products of the
-    witness and the m edge wrenches of a contact set, `wrench` (b, m, 6). The margin is the greatest
-    s for which coefficients >= s, of sum 1, balance these wrenches. The bound has no unit.
+    `wrench` (b, m, 6) holds the m edge wrenches of each contact set, and g are their products with
+    the witness. The bound is -min(g) / sum(g - min(g)), or NaN if all g are 0. The margin is the
+    greatest s for which coefficients >= s, of sum 1, balance these wrenches. The bound has no unit.
     """
     # With g_k = w.w_k and phi >= s, 0 = sum phi g >= s sum g + (1 - m s) min g. Hence s <= -min g /
     # sum(g - min g).

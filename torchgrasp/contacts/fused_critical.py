@@ -384,7 +384,9 @@ def search(
 ) -> tuple[Bool[Tensor, "b"], "critical.LeastBalance"]:
     """Return a mask of the contact sets that can balance, and the balances of all sets.
 
-    Those of other sets mean nothing. The `axes` are those of `_Cones`.
+    The balances of sets that cannot balance mean nothing. `points` (b, f, 3) are the contacts. The
+    rows of `axes` (b, f, 3, 3) are the inward normal and two tangents at each contact. `load` (b,
+    6) is the normalised wrench that the contacts balance, as in `least_balance`.
     """
     b, f = points.shape[:2]
     numbers = critical.CRITICAL

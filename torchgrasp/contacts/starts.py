@@ -100,8 +100,8 @@ def drawn_starts(
     time.
 
     Without flatness in the spec of `settled` the guesses are drawn as in the paper (Sec. 6.2). With
-    flatness they are sets of its candidate contacts. The centroid of contacts on flat surface may
-    lie far from the object's centre.
+    flatness they are sets of its candidate contacts, whose centroid may lie far from the object's
+    centre.
     """
     spec, candidates = settled
     generator = torch.Generator().manual_seed(seed)
@@ -121,10 +121,10 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
     """Return the constraints with a known `flat_radius`, and candidate contacts.
 
     If `spec.flat_radius` is None, one of 8, 6, 4 and 3 mm (`FLAT_RADII`) is chosen. It is the
-    largest with which enough random guesses have force closure, else 3 mm. The candidates are
-    random surface points at which the surface is flat. If fewer points than fingertips are flat,
-    the candidates are all drawn points. They are None if `spec` demands no flatness. `seed` draws
-    the points.
+    largest with which at least 25 sets of candidates with force closure are found, else 3 mm. The
+    candidates are random surface points at which the surface is flat. If fewer points than
+    fingertips are flat, the candidates are all drawn points. They are None if `spec` demands no
+    flatness. `seed` draws the points.
     """
     if spec.flatness is None:
         return FlatCandidates(spec, None)

@@ -175,8 +175,8 @@ class GraspTry:
 
     @property
     def lost(self) -> bool:
-        """Whether the hand detected in the lift that it loses the object. Its fingertips then no
-        longer touch, or slide too far (`LiftCheck`).
+        """Whether the hand detected in the lift that it loses the object. Fewer than two fingertips
+        then touch, and carry less than 0.2 N, or two have slid by 1.5 mm (`LiftCheck`).
         """
         return self.check.lost
 

@@ -36,9 +36,10 @@ RAISED = 1e-3  # greatest height [m] by which a raised hand is below the height 
 def find_cause(tries: Sequence[LiftTry], trial: GraspTrial, spec: TrialSpec) -> tuple[str, float]:
     """Return (cause, size): why the object was not held in the last try of a trial.
 
-    The cause is a key of the dict `CAUSES`, which also holds the unit of the size. `ProtocolResult`
-    explains all causes. The result is ("", NaN) if the object was held, or the simulation did not
-    stay finite. `tries` are the results of the trial's lifts, and `trial` and `spec` its input.
+    The cause is a key of the dict `CAUSES`, such as "toppled" or "too weak". `CAUSES` also holds
+    the unit of the size, and a sentence that explains the cause. The result is ("", NaN) if the
+    object was held, or the simulation did not stay finite. `tries` are the results of the trial's
+    lifts, and `trial` and `spec` its input.
     """
     truth = trial.truth
     *before, (row, lift) = tries

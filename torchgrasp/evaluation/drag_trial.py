@@ -201,8 +201,10 @@ def lift_from_edge(
         parts: convex parts [m] of the mesh, as for `drag_object`.
         table: the true table, with its edge. None means that of the plan.
 
-    Raises the errors of `drag_object` and `lift_grasps`, and `BadArgument` for a plan without an
-    executable grasp.
+    Raises `BadArgument` for a plan of another hand or without an executable grasp. It is also
+    raised for a mesh that does not stand on the table, and for sensors that cannot measure the
+    drag. Raises `MeshError` for a mesh that is missing, open or without volume, and `MissingExtra`
+    without the simulator.
 
     >>> import torch
     >>> from torchgrasp import ContactSpec, Plane, load_hand, plan_edge_grasps

@@ -73,8 +73,9 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
         trial: the hand, a single grasp and the true object.
         protocol: a protocol with pulls, or its name in `PROTOCOLS`.
 
-    Raises the errors of `close_hand`. Raises `BadArgument` for an unknown protocol, or one without
-    pulls.
+    Raises `BadArgument` for an unknown protocol, or one without pulls. It is also raised for a
+    trial whose hand, grasp, mesh and table do not fit together. Raises `MeshError` for a mesh that
+    is missing, open or without volume, and `MissingExtra` without the simulator.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -53,8 +53,8 @@ def can_compile() -> bool:
 
 
 def is_fused(*tensors: Tensor) -> bool:
-    """Return whether compiled loops are on and can compute with all of these tensors. They can if a
-    tensor is float64 on the CPU, needs no gradient, and is not inside torch.vmap.
+    """Return whether compiled loops are on and can compute with all of these tensors. They can if
+    every tensor is float64 on the CPU, needs no gradient, and is not inside torch.vmap.
 
     Raises `MissingExtra` if the environment has TORCHGRASP_FUSED=1, but numba is not installed.
     Raises `BadArgument` for a value of TORCHGRASP_FUSED other than "0", "1" or none.

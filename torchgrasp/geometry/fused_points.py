@@ -46,7 +46,8 @@ def _squared_gap(point, low, high):
 def find_nearest(point, boxes, stack, kept, nearest):
     """Write the indices of the points in `boxes` that are nearest to a `point` into `nearest`.
 
-    The points of all leaves are counted, leaf by leaf. As many are found as `nearest` has places.
+    An index counts the points of all leaves, leaf by leaf. As many are found as `nearest` has
+    places.
 
     Args:
         point: the point, three numbers.

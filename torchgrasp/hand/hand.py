@@ -247,7 +247,8 @@ class Hand(Value):
         """Return the positions (*b, j) [rad or m] of all j movable joints of the URDF.
 
         They are in the order of `tree.joint_names`. `joints` (*b, h) [rad or m] are positions of
-        the actuated joints. Raises the errors of `expand`.
+        the actuated joints. Raises `BadArgument` for joints of a wrong count, dtype or device, and
+        for NaN or infinity.
         """
         return self.actuated.expand(joints)
 

@@ -26,10 +26,10 @@ KEY = "drag"
 def with_drag(grasps: Grasps, drag: DragPlan) -> Grasps:
     """Return the grasps with a `drag` that comes before them, as JSON text in `meta["drag"]`.
 
-    `Grasps.save` writes the text too, and `drag_of` reads the drag from it. It is in the frame of
-    the cloud. Its keys end with the units. `joints_rad` maps names of joints to positions, and
-    `feet_m` names of pressing fingers to points. Raises `BadArgument` for a drag of another hand
-    than that of the grasps.
+    `Grasps.save` writes the text too, and `drag_of` reads the drag from it. Positions in the text
+    are in the frame of the cloud. The keys of the text end with the units. `joints_rad` maps names
+    of joints to positions, and `feet_m` names of pressing fingers to points. Raises `BadArgument`
+    for a drag with another number of joints or fingers than the grasps.
 
     >>> from torchgrasp import ContactSpec, Plane, load_object, plan_edge_grasps
     >>> x = torch.tensor([1.0, 0, 0])

@@ -108,8 +108,8 @@ class Funnel(Value):
     def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
         """Return the losses, counted in the results of four planning stages.
 
-        `plan` is the result of stage "plan", and `closed` that of "certify" (only closed contact
-        sets). `seeds` is that of "query", and `grasps` that of "refine".
+        `plan` holds the planned contact sets, and `closed` the certificates of those with force
+        closure. `seeds` holds the initial hand postures for these, and `grasps` the checked grasps.
         """
         far = len(closed) - len(seeds.row.unique())
         stages = (
@@ -319,7 +319,8 @@ def explain_empty(
             "funnel", and the value holds the losses of the plan without a change. Then the name is
             "change", and the value is the result of each change.
 
-    Raises the errors of `plan_grasps`.
+    Raises `BadArgument` for a wrong argument or a bad cloud, and `HandFileError` for a bad hand, as
+    `plan_grasps` does.
 
     >>> from torchgrasp import load_hand, load_object
     >>> spec = ContactSpec(friction=0.0, table=0.0)

@@ -223,8 +223,8 @@ def stream_grasps(
         fingers, task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
         mode, ranking, time_budget, shape, observer: as in `plan_grasps`.
 
-    Raises the errors of `plan_grasps`. Errors of arguments and files are raised at the call. Errors
-    that depend on the points, such as a wrong size, are raised at the first iteration.
+    Raises `BadArgument` for a wrong argument, and `HandFileError` for a bad hand, both at the call.
+    Errors that depend on the points, such as a wrong size, are raised at the first iteration.
 
     >>> from torchgrasp import load_hand, load_object
     >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=12))

@@ -371,8 +371,8 @@ class Objects:
 def pose_request(request: Request, hand: Hand) -> Objects:
     """Return the one object of a request in its upright frame, ready to be planned for a hand.
 
-    All three steps are taken: seen, shaped and posed. The last, `pose`, adds the `hand`, the
-    constraints, the initial guesses and the obstacles.
+    The object is found in the cloud or scene, and its shape is estimated. Then `pose` adds the
+    `hand`, the constraints, the initial guesses and the obstacles.
     """
     model = find_model(request)  # first, so that a missing model is told before any work
     return pose(ShapedObject.of(request), request, hand, model)

@@ -70,8 +70,9 @@ class Report:
     def note(self, stage: str, value: Any, offered: int = 0) -> None:
         """Store the result of one stage of one batch, and report the stage after its last batch.
 
-        `stage` is "plan", "certify" or "query", and `value` its result. `offered` is the number of
-        contact sets that stage "certify" checked; other stages do not use it.
+        `stage` is "plan" (contact planning), "certify" (force closure) or "query" (initial hand
+        postures), and `value` its result. `offered` is the number of contact sets that stage
+        "certify" checked; other stages do not use it.
         """
         if not self.heard:
             return

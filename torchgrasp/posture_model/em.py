@@ -294,8 +294,8 @@ def maximisation(
         regularisation: added to every variance.
         reseeded: how often each component has collapsed before.
 
-    A component collapses if its covariance is singular or it has fewer than d + 1 rows. It is
-    replaced by half of the heaviest component, split across its longest axis. Raises
+    A component in d dimensions collapses if its covariance is singular or it has fewer than d + 1
+    rows. It is replaced by half of the heaviest component, split across its longest axis. Raises
     `IndefiniteCovariance` if a component collapses more than three times (`EM.most_reseeds`).
     """
     components = components_from_sums(sums, n, regularisation)

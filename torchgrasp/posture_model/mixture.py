@@ -185,8 +185,8 @@ class GraspMixture(GaussianMixture):
             variance.
         meta: texts that describe hand, samples and fit.
 
-    Raises the errors of `GaussianMixture`, and `BadArgument` if the last `names` are not
-    `CODE_NAMES`.
+    Raises `BadArgument` if the last `names` are not `CODE_NAMES`, or for weights or covariances
+    that no mixture has (`GaussianMixture`).
 
     >>> from torchgrasp import encode
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -146,7 +146,9 @@ def growing_bic(
     no random number. The criterion belongs to the given postures: more postures support more
     Gaussians. Codes of "uniform" samples are exact functions of the joints, so the BIC falls
     without end. For "grasping" samples, whose fingertips roll, the BIC has a minimum. The
-    `observer` is called with each number of Gaussians. Raises the errors of `fit_mixture`.
+    `observer` is called with each number of Gaussians. Raises `BadArgument` for too few samples,
+    codes not of three fingers, or a joint that does not vary. Raises `IndefiniteCovariance` if a
+    Gaussian collapses more than three times.
 
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
     >>> growing_bic(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), most=3).components

@@ -45,8 +45,8 @@ def read_scene(path: Path | str) -> Scene:
     Other arrays are not read; `Scene.notes` names them.
 
     Raises `CloudFileError` for no such file, or for malformed content. Raises `BadArgument` for a
-    `target` that is no label of an object, or a normal not of length 1. Also raises the errors of
-    `Scene.from_depth`, such as `NoSupport` if no table is found.
+    `target` that is no label of an object, or a normal not of length 1. It is also raised for
+    arrays that `Scene.from_depth` refuses. Raises `NoSupport` if no table is found.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene

@@ -70,8 +70,8 @@ class MergeNumbers:
     hidden.
     """
     lesser: float = 0.1
-    """Number of a body's points, over the other body's, up to which it is a part of that one. Such
-    a part is a knob.
+    """Ratio of a body's number of points to another body's, up to which it is a part of that body,
+    such as a knob.
     """
     upon: float = 0.01
     """Least height [m] of the top of a body over that of another one on which it lies."""

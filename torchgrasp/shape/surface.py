@@ -303,7 +303,7 @@ def newton_step(
     """Return Newton steps (n, 3) along the gradients to the zero level, each at most `longest`
     long.
 
-    `value` is the mean distance at n points; it, `longest` and the steps are normalised. Squared
+    `value` is the mean distance at n points. Distances, `longest` and steps are normalised. Squared
     slopes below `least_slope` are raised to it.
     """
     step = -value / (gradient * gradient).sum(-1).clamp_min(least_slope)

@@ -49,7 +49,7 @@ class BodyNumbers:
     iterations: int = 32
     """Iterations of the solver for positions in each step; with more, held objects creep less."""
     scale: float = 0.01
-    """Ratio of true lengths to those of the shapes that PhysX prepares. It drops vertices within
+    """Ratio of true lengths to those of the shapes that PhysX prepares. PhysX drops vertices within
     0.7 mm of a hull.
     """
     hull: int = 129

@@ -491,9 +491,9 @@ def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
 
 
 def check_limit(max_force: float | None, closing: str, holding: str) -> None:
-    """Raise `BadArgument` for a largest force [N] that the modes do not keep.
-
-    The springs of "impedance" add to its forces. Positions alone command no force.
+    """Raise `BadArgument` if `max_force` [N] is given, but the modes `closing` and `holding` do not
+    keep the forces below it. The springs of the holding "impedance" add to its forces. Modes that
+    command positions alone bound no force.
     """
     if max_force is None or closing == "open_loop":
         return

@@ -206,8 +206,8 @@ class ModelHand:
         """Return which joints of the hand lead, which follow others, and which stand still.
 
         Actuators may drive joints and fixed tendons; linear equalities may tie them to each other.
-        Raises `HandFileError` for others that move the hand, such as spatial tendons or a closed
-        loop of bodies. Raises it also for equalities that contradict each other.
+        Raises `HandFileError` for other elements that move the hand, such as spatial tendons or a
+        closed loop of bodies. Raises it also for equalities that contradict each other.
         """
         model = self.model
         own = self.joints

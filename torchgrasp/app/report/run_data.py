@@ -140,7 +140,8 @@ class Run:
 def verdict(run: Run) -> str:
     """Return the result of a run in words: of the closing if there is one, else of planning.
 
-    The latter is how many grasps passed all checks or, if none did, why, and what would help.
+    For planning, the text says how many grasps passed all checks. If none did, it says why, and
+    what would help.
     """
     hand = run.hand.name
     name = run.object_name
