@@ -314,11 +314,11 @@ def check_intrinsics(k: Matrix, stated: list[float] | None, size: Sequence[int])
     """Raise `BadArgument` for intrinsics that no camera has, or that do not belong to an image of
     this size.
 
-    The first are a field of view above 147 degrees, and numbers in a wrong order. The second are a
-    principal point more than 8 sides from the middle, and intrinsics of another resolution. The
-    resolution is right if `stated` is the image's size, or that of a larger image around it.
-    Without `stated`, the principal point shows the resolution. A `CloudWarning` is given if fx and
-    fy differ by over 12 % (`LIMITS.uneven`).
+    No camera has a field of view above 147 degrees. Numbers in a wrong order, such as cx, cy, fx,
+    fy, are refused, too. Intrinsics of another image have a principal point more than 8 sides from
+    the middle, or another resolution. The resolution is right if `stated` is the image's size, or
+    that of a larger image around it. Without `stated`, the principal point shows the resolution. A
+    `CloudWarning` is given if fx and fy differ by over 12 % (`LIMITS.uneven`).
 
     Args:
         k: matrix of the intrinsics [pixels].

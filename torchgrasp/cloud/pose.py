@@ -324,10 +324,10 @@ def find_plausible(
 
     `points` (n, 3) [m] and the `table` are in the frame to which the `pose` leads. The table is a
     plane or a height z [m]. With None, planes are sought in the points. `up` is the direction
-    against gravity there. With None, planes may face any way. But unless the frame is the camera's,
-    walls are left out if a plane is level. `known_unit` is whether the user gave the unit of the
-    depth. Supports that carry the `target` come first. Raises `BadArgument` for a pose or a unit
-    that the view contradicts, and `NoSupport` if there is no plane.
+    against gravity in this frame. With None, planes may face any way; but if a plane is level,
+    walls are left out, unless the frame is the camera's. `known_unit` is whether the user gave the
+    unit of the depth. Supports that carry the `target` come first. Raises `BadArgument` for a pose
+    or a unit that the view contradicts, and `NoSupport` if there is no plane.
     """
     eye = pose[:3, 3]
     image_up = -pose[:3, 1] if up is None and _is_own(pose) else None

@@ -223,12 +223,14 @@ def camera_support(
     noise: float,
     table: float | None,
 ) -> ExtraObservations:
-    """Return the observations in addition to the cloud's points, with distances measured from these
-    points.
+    """Return what is observed in addition to the cloud's points with the support "camera" of
+    `fit_shape`.
 
-    If the cloud `seen` [m] is a view with a `completion`, they include its hidden side and free
-    space. `noise` is the standard deviation of the distance observed inside, normalised; `table` is
-    the table's height [m], or None.
+    Points on a sphere around the object are observed, and its centre if that is inside. Their
+    distances are those of the nearest points on the surface. If the cloud `seen` [m] is a view with
+    a `completion`, its hidden side and free space are observed, too. `noise` is the standard
+    deviation of the distance observed inside, normalised; `table` is the table's height [m], or
+    None.
     """
     kind: Kind = "whole"
     parts = ()

@@ -300,8 +300,10 @@ class ShapeGP(Posterior, Normalisation):
         The result has the dtype of `points`. Samples of one seed are twice differentiable in the
         points. Where points coincide, the derivatives assume that these points move together.
 
-        Raises `BadArgument` for the causes of `joint`, and for n outside 0 to 1,000,000. Raises
-        `IndefiniteCovariance` if the covariance of the points is not positive semidefinite.
+        Raises `BadArgument` for numbers that are not finite, more than 1000 points
+        (`DOMAIN.joint`), or points outside the domain. It is also raised for n outside 0 to
+        1,000,000. Raises `IndefiniteCovariance` if the covariance of the points is not positive
+        semidefinite.
         """
         joint = self.joint(points.double())
         prior = float(self.prior_block()[0, 0].detach())
@@ -340,7 +342,8 @@ class ShapeGP(Posterior, Normalisation):
             normal_noise: standard deviation of the components of a unit normal (no unit).
 
         Raises `BadArgument` for a wrong argument, a normal of length 0, or a point outside the
-        domain. It is also raised for a view that contradicts `cloud`, as in `merge_clouds`.
+        domain. It is also raised for a view that is farther from `cloud` than about three times the
+        noise.
 
         >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
         >>> from torchgrasp import fit_shape
