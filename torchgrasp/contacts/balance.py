@@ -323,11 +323,11 @@ def central_forces(
     """Return balanced forces (b, f, 3) that need nearly the least friction, near the preferred
     normal forces.
 
-    `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals. `preferred`
-    are normal forces, which also fix the scale of the result. `slack` is added to the friction
-    coefficient that the forces need. A larger one gives forces nearer to the preferred ones. The
-    forces of a set are NaN if no balanced forces push at every contact. They are also NaN if those
-    need a friction coefficient above 10 (`BALANCE.max_friction`).
+    `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals. All are in
+    one frame. `preferred` are normal forces, which also fix the scale of the result. The forces may
+    need a friction coefficient greater by `slack` than the least one. A larger `slack` gives forces
+    nearer to the preferred ones. The forces of a set are NaN if no balanced forces push at every
+    contact with a friction coefficient up to 10 (`BALANCE.max_friction`).
     """
     wrench = grasp_map(points / centre_and_radius(points)[1])
     null = torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:]

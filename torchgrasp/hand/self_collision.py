@@ -387,8 +387,8 @@ class BoxPairs(NamedTuple):
         """Return two vectors of each pair: the unit vector of axis `best` towards box b, then the
         contact point [m].
 
-        The contact point is relative to the centre of box b. `best` is the index of an axis of
-        `along_axes` for each of c pairs.
+        The contact point is relative to the centre of box b. `best` is the index of one of the 15
+        axes of `along_axes` for each pair (c = k).
         """
         a, b, gap, half_a, half_b = self
         best = best[None]

@@ -79,10 +79,10 @@ def relax(objects: Objects, batches: Iterator[Grasps], deadline: float) -> Itera
     Likely is a predicted success above 0.5 (`LIKELY`). Contacts must be flat within the largest of
     four radii that the object allows (`FLAT_RADII`), which can leave few contacts. With relaxed
     constraints (`ContactSpec.relaxed`) the hand may begin above its pose, too, and go down while it
-    closes (`opened_pose`). Of earlier constraints, the batches up to the last one with an
-    executable grasp are kept. Of the last constraints, all batches are kept. `batches` are those of
-    the first constraints. After `deadline` [s], a time of `time.monotonic`, constraints are no
-    longer relaxed.
+    closes (`opened_pose`). Failed batches at the end of a search are yielded only for the last
+    constraints. For earlier constraints, no batch after the last one with an executable grasp is
+    yielded. `batches` are those of the first constraints. After `deadline` [s], a time of
+    `time.monotonic`, constraints are no longer relaxed.
     """
     failed = list[Grasps]()
     best = 0.0

@@ -206,9 +206,10 @@ def fit_upright(
     """Return the shape fitted to a cloud [m] without duplicates in a frame whose z axis points up.
 
     `table` is the table's height [m]; None means no table. `seed` is the random seed, and `options`
-    are those of `fit_shape`. `in_image` says that the points are pixels of a depth image. Then they
-    need not be compared with their camera. `neighbours` are those of the points in float64; None if
-    they are not yet known. A `CloudWarning` is given for a doubtful cloud, such as one in a plane.
+    are those of `fit_shape`. `in_image` says that the points were cut out of a depth image. Checks
+    of the camera, and for points of the table in the cloud, are then left out. `neighbours` are
+    those of the points in float64; None if they are not yet known. A `CloudWarning` is given for a
+    doubtful cloud, such as one in a plane.
     """
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))

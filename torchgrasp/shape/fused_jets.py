@@ -34,8 +34,8 @@ def evaluate_mean_jet(of: Weighted, x: Queries) -> tuple[tuple[Tensor, Tensor, T
     """Return ((distance, gradient, Hessian), None): the mean with derivatives at q normalised
     points.
 
-    `of` holds the observations and weights. None stands for kernel values, which the function of
-    this name in `jets` returns.
+    `of` holds the observations and weights. The second result is always None: the compiled loops
+    keep no kernel values for the variance, unlike `jets.evaluate_mean_jet`.
     """
     return _mean(of.arrays, x, bent=True), None
 
