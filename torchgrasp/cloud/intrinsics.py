@@ -71,8 +71,8 @@ class IntrinsicsNumbers:
     by less, images that were resized to other proportions by more.
     """
     beside: float = 0.1
-    """Greatest shift of the principal point from the image's middle, over the side, at which four
-    numbers count as in the right order.
+    """Greatest shift of the principal point from the image's middle, over the side, of numbers in
+    the right order.
     """
     farthest: float = 8.0
     """Greatest shift of the principal point of a crop from the crop's middle, as a share of the

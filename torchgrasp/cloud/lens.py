@@ -140,8 +140,8 @@ def read_lens(named: Mapping[str, Any]) -> Lens | None:
 
     Names are in lower case. There is hardly any if no coefficient exceeds 0.001 (`LENS.straight`).
     Raises `BadArgument` for a model that is no rational polynomial, such as a fisheye's. Raises it
-    also for a list of fewer than 4 coefficients or with more than the first 8, and for a
-    coefficient that is not below 10,000 (`LENS.most`).
+    also for a list of fewer than 4 coefficients, or with one after the eighth. The same is raised
+    for a coefficient that is not below 10,000 (`LENS.most`).
     """
     lists = [named[name] for name in LISTS if named.get(name) is not None]
     found = {name: named[name] for name in (*NAMES, *OFF_CENTRE) if named.get(name) is not None}

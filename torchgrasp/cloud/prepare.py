@@ -402,8 +402,8 @@ def merge_clouds(
         BadArgument: views that contradict each other by more than about three times their noise. A
             pose is wrong, or the object moved.
 
-    A view or the result that is no valid cloud raises an error (`check_cloud`), such as
-    `SuspiciousScale` for an extent outside [5 mm, 2 m].
+    Views and result must be valid clouds (`check_cloud`). For an extent outside [5 mm, 2 m], for
+    example, `SuspiciousScale` is raised.
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> len(merge_clouds([view, view], [torch.eye(4), torch.eye(4)]))

@@ -327,7 +327,7 @@ def central_forces(
     one frame. `preferred` are normal forces, which also fix the scale of the result. The forces may
     need a friction coefficient greater by `slack` than the least one. A larger `slack` gives forces
     nearer to the preferred ones. The forces of a set are NaN if no balanced forces push at every
-    contact with a friction coefficient up to 10 (`BALANCE.max_friction`).
+    contact. The friction coefficient for this is at most 10 (`BALANCE.max_friction`).
     """
     wrench = grasp_map(points / centre_and_radius(points)[1])
     null = torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:]

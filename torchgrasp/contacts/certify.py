@@ -237,7 +237,7 @@ def bound_margin(wrench: Wrenches, witness: Float[Tensor, "b 6"]) -> Float[Tenso
     """Return the upper bound of the closure margin that each direction `witness` in wrench space
     proves.
 
-    `wrench` (b, m, 6) holds the m edge wrenches of each contact set, and g are their products with
+    `wrench` (b, m, 6) holds the m edge wrenches of each contact set. Let g be their products with
     the witness. The bound is -min(g) / sum(g - min(g)), or NaN if all g are 0. The margin is the
     greatest s for which coefficients >= s, of sum 1, balance these wrenches. The bound has no unit.
     """

@@ -90,9 +90,9 @@ def pivot(
 
     The programmes are: maximise a.v with c_k.v <= 1 for m bounds c_k. `objective` holds a, and
     `bounds` the c_k. An index is -1 for an artificial bound, one of v = 0, that stayed tight. The
-    direction is that in which a.v grows without bound, or 0. The `numbers` are the most pivots, the
-    multiplier that counts as zero, the gain of artificial bounds, and the least rate of approach to
-    a bound.
+    direction is that in which a.v grows without bound, or 0. The `numbers` are the most pivots and
+    the multiplier that counts as zero. Then follow the gain of artificial bounds, and the least
+    rate of approach to a bound.
     """
     tight = objective.new_full(objective.shape, -1).long()
     ray = objective.new_zeros(objective.shape)

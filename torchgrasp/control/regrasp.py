@@ -194,10 +194,10 @@ class GraspTry:
         """Return whether the lift has failed and must end: the hand loses the object, or the object
         is too heavy for it. Call it at the end of each tick, a period of the controller.
 
-        A hand that has risen by 10 mm loses the object if fewer than two fingertips touch, and all
-        carry less than 0.2 N. The hand also loses it if two fingertips slide by more than 1.5 mm
-        each before the hand is 20 mm high (`LiftCheck`). The object is too heavy if the fingertips
-        measure more load than the hand can hold (`GraspController.status`).
+        The hand loses the object in two cases (`LiftCheck`). From a height of 10 mm on, fewer than
+        two fingertips touch, and all together carry less than 0.2 N. Or two fingertips have each
+        slid by more than 1.5 mm before the height was 20 mm. The object is too heavy if the
+        fingertips measure more load than the hand can hold (`GraspController.status`).
 
         Args:
             observation: what the hand measures at the end of the tick (`observe`).

@@ -202,9 +202,9 @@ def lift_from_edge(
         table: the true table, with its edge. None means that of the plan.
 
     Raises `BadArgument` for a plan of another hand or without an executable grasp. It is also
-    raised for a mesh that does not stand on the table, and for sensors that cannot measure the
-    drag. Raises `MeshError` for a mesh that is missing, open or without volume, and `MissingExtra`
-    without the simulator.
+    raised for a mesh off the table, and for sensors that do not measure the pressing forces. Raises
+    `MeshError` for a mesh that is missing, open or without volume, and `MissingExtra` without the
+    simulator.
 
     >>> import torch
     >>> from torchgrasp import ContactSpec, Plane, load_hand, plan_edge_grasps

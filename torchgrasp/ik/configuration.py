@@ -115,8 +115,8 @@ class SpatialJacobian(Value):
     def jacobian(
         self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]
     ) -> Float[Tensor, "g k d"]:
-        """Return the derivatives of k residuals of each configuration by the hand's pose (6) and
-        its h actuated joints (d = 6 + h).
+        """Return the derivatives of k residuals of each configuration by its d = 6 + h unknowns.
+        These are the hand's pose (6) and the h actuated joints.
 
         `wrench` holds the residuals' derivatives by a translation [m] and a rotation [rad] about
         the object's origin. `moves` is 1 where a motion changes a residual, else 0.

@@ -70,8 +70,8 @@ class MergeNumbers:
     hidden.
     """
     lesser: float = 0.1
-    """Ratio of a body's number of points to another body's, up to which it is a part of that body,
-    such as a knob.
+    """Greatest number of points of a part of another body, such as a knob, over that body's number
+    of points.
     """
     upon: float = 0.01
     """Least height [m] of the top of a body over that of another one on which it lies."""

@@ -56,10 +56,10 @@ def first_touches(closure: ClosureResult) -> list[int]:
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     """Return the index of the control tick at which the object was lost; None if it was held.
 
-    It was lost when it was pushed away by 50 mm, or slipped by 20 mm or turned by 30 degrees in the
-    hand. It was also lost when fewer than two fingers still touched it. An object that was put down
-    as too heavy was lost at the hand's greatest height. `centre` is its centre of mass [m] in the
-    frame of the grasp, where z is up.
+    It was lost when it was pushed away by 50 mm. It was also lost when it slipped by 20 mm or
+    turned by 30 degrees in the hand. A third case is that fewer than two fingers still touched it.
+    An object that was put down as too heavy was lost at the hand's greatest height. `centre` is its
+    centre of mass [m] in the frame of the grasp, where z is up.
     """
     if closure.held:
         return None
