@@ -224,8 +224,8 @@ def _judge(distance: float, limit: float) -> tuple[float, float, float]:
 
 def align_views(views: Sequence[PointCloud]) -> list[tuple[Float[Tensor, "4 4"], float]]:
     """Return a motion new_from_old (4, 4) [m] of each view, after which the views agree best.
-    Return also the standard deviation [m] along the surface's normals of the part of the motion
-    that the overlap does not show.
+    Return also its standard deviation [m] along the surface's normals, as far as the overlap leaves
+    it open.
 
     The views [m] have normals and are in one frame. The first stays. Each other one is moved onto
     the views that are already placed. A motion that noise does not explain raises the warning
