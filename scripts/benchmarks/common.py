@@ -20,6 +20,7 @@ import torch
 from torchgrasp.evaluation.intervals import Share, contrast_over
 from torchgrasp.files import format_json, write_file
 from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.fused import are_on
 from torchgrasp.foundation.jobs import run_tasks
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -267,14 +268,14 @@ def describe_commit() -> str:
 
 
 def describe_run(threads: int) -> str:
-    """Return commit, processor, threads and version of torch in one line."""
+    """Return commit, processor, threads, version of torch, and loops on or off, in one line."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     processor = names[0] if names else platform.processor() or platform.machine()
     return (
         f"Commit {describe_commit()}; {processor}, {os.cpu_count()} cores; {threads} threads; "
-        f"torch {torch.__version__}."
+        f"torch {torch.__version__}; compiled loops {'on' if are_on() else 'off'}."
     )
 
 
