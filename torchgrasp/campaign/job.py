@@ -54,8 +54,9 @@ def plan_jobs(meta: dict[str, str], *task: Any) -> list[Grasps | None]:
     """Return the executable grasps of several jobs, those that passed all checks; None for a job
     that could not be planned.
 
-    `task` holds the arguments of `plan_views`. Raises `BadArgument` on a machine whose software
-    differs from `meta["versions"]`.
+    `task` holds the arguments of `plan_views`, with one view for each job. `meta["versions"]` holds
+    the software versions at the campaign's start, as JSON. Raises `BadArgument` on a machine with
+    others.
     """
     check_versions(meta)
     return plan_views(*task)

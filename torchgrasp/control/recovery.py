@@ -61,8 +61,8 @@ class GraspCheckNumbers:
     last: float = 0.3
     """Time [s] of pressing until which touches are averaged."""
     misplaced: float = 0.008
-    """Largest distance [m] between the translations of object and palm in a secure grasp: twice the
-    estimate's error.
+    """Largest difference [m] of two translations in a secure grasp: those of object and palm since
+    the planned poses. It is twice the error of the estimated translation.
     """
 
 

@@ -93,8 +93,8 @@ class UncertaintyClosing:
       the contact.
     * Fingertips with contacts on the rim of a low object go down to the table. They slide along it
       to the object.
-    * A palm that starts above its planned pose (`ClosingReference.rise`) goes down as far as the
-      fingers' arcs go up.
+    * A palm that starts above its planned pose (`ClosingReference.rise`) goes down while the
+      fingers close. It goes down as far as the closing raises the fingertips on their arcs.
     * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers
       close.
     """

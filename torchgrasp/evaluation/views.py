@@ -193,11 +193,11 @@ def _plan(
 def plan_view(
     view: ObjectView, protocol: Protocol, spec: EvaluationSpec, planned: Path | Grasps | None = None
 ) -> PlannedView:
-    """Return the executable grasps of a view for a protocol, with the view's score. Executable
-    grasps passed all checks of the planner. `spec` has the options of planning.
+    """Return the executable grasps of a view for a protocol, with the view's score and its cloud.
+    Executable grasps passed all checks of the planner. `spec` has the options of planning.
 
     If there are none, the score's `refusal` says why. `planned` are grasps that exist already: the
-    path of their file, or what `plan_views` returned. With None, or if these grasps are none, the
+    path of their file, or what `plan_views` returned. If `planned` is None or holds no grasp, the
     view is planned here.
     """
     hand = view.load_hand()

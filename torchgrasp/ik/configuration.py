@@ -127,11 +127,12 @@ class SpatialJacobian(Value):
 
 
 def differentiate(spatial: SpatialJacobian, parts: Sequence[ResidualRows]) -> Residuals:
-    """Return (residual, Jacobian) of all `parts`, one part after the other.
+    """Return (residual, Jacobian) of several groups of residuals, one group after the other.
 
-    The m residuals (g, m) of g hands are lengths [mm] or weighted errors of cosines. The Jacobian
-    (g, m, 6 + h) is by the pose's translation [m] and rotation [rad], then by the h actuated
-    joints. `spatial` holds the kinematics of the hands.
+    `parts` are the groups. The m residuals (g, m) of g hands are lengths [mm], or weighted errors
+    of the cosines between pads and surface. The Jacobian is (g, m, 6 + h). It is by the pose's
+    translation [m] and rotation [rad], then by the h actuated joints. `spatial` holds the
+    kinematics of the hands.
     """
     residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))
     return residual, spatial.jacobian(wrench, moves)

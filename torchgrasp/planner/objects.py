@@ -227,10 +227,10 @@ class Objects:
         return self.request.grasp_task.lifts(self.spec.plane)
 
     def weight_on(self, contacts: Contacts, cloud: CloudIndex) -> Float[Tensor, "b 6"]:
-        """Return the mean weight of each contact set's object, as a wrench in the upright frame.
+        """Return the weight of each contact set's object, as a wrench in the upright frame.
 
-        It is a force [N], then a torque [N m] about the contacts' centroid. `cloud` (b,) is the
-        index of each contact set's object.
+        It is a force [N], then a torque [N m] about the contacts' centroid. The mass is the mean of
+        the task's distribution. `cloud` (b,) is the index of each contact set's object.
         """
         center = self.body.rows(cloud).center.to(contacts.points)
         mass = Distribution.of(self.request.grasp_task.mass).mean

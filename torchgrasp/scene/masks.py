@@ -40,8 +40,8 @@ class MaskNumbers:
     the target.
     """
     mask_share: float = 0.3
-    """Least share of the mask above the table that a segmented object of the target fills. Such an
-    object belongs to the target, too.
+    """Least share of the mask's pixels above the table that are on one segmented object. With this
+    share or more, the object belongs to the target, too.
     """
     low: float = 0.01
     """Height [m] above the support below which a pixel counts as lying on it."""

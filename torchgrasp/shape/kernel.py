@@ -142,12 +142,11 @@ def differentiate(
     u: Float[Tensor, "*s"],
     count: int,
 ) -> tuple[Float[Tensor, "*s"], ...]:
-    """Return the first `count` (1 to 4) of k and its derivatives with respect to u = r^2 / 2, by
-    autograd.
+    """Return the first `count` (1 to 4) of k, dk/du, d2k/du2 and d3k/du3, by autograd.
 
-    They are differentiable by u to any order, but at r = 0 only those up to (d/du)^2 k are right.
-    Higher ones, and infinite ones, count as 0 there. Covariances and their second derivatives
-    multiply them by a power of r.
+    `profile` is the kernel k as a function of the normalised distance r, and u = r^2 / 2. The
+    results are differentiable by u to any order. At r = 0, only k and its first two derivatives
+    are right. Higher and infinite ones count as 0 there: covariances multiply them by a power of r.
     """
     least = PROFILE.near_zero**2 / 2
     near = u < least

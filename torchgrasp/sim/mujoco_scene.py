@@ -125,7 +125,9 @@ class MujocoScene(SimulatedScene):
         return reopen
 
     def drive(self, targets: np.ndarray) -> None:
-        """Set the `targets` (j,) [rad or m] of the j driven joints."""
+        """Set the position `targets` (j,) [rad or m] of the j driven joints, in the order of
+        `joint_names`.
+        """
         self.data.ctrl[self.motors] = targets
 
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:

@@ -139,9 +139,10 @@ def rigid_body(material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: fl
     """Return a dynamic body of uniform density, made of convex hulls.
 
     `spec` gives mass and inertia, and `material` is PhysX's surface material. `hulls` are the
-    vertices (v, 3) [m] of each hull, and `patch` [m] is the radius of contact patches. PhysX drops
-    vertices within 0.7 mm of the hull of the others. Therefore it gets hulls a hundred times as
-    large.
+    vertices (v, 3) [m] of each hull, and `patch` [m] is the radius of contact patches.
+
+    PhysX drops vertices within 0.7 mm of the hull of the others. Therefore this function passes the
+    hulls a hundred times as large, with a scale of 1/100.
     """
     sapien, physx = import_sapien()
     scale = BODIES.scale

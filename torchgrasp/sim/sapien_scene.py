@@ -145,7 +145,9 @@ class SapienScene(SimulatedScene):
 
     @_noted
     def drive(self, targets: np.ndarray) -> None:
-        """Set the `targets` (j,) [rad or m] of the j driven joints."""
+        """Set the position `targets` (j,) [rad or m] of the j driven joints, in the order of
+        `joint_names`.
+        """
         for joint, target in zip(self._driven, targets.tolist(), strict=True):
             joint.set_drive_target(target)
 

@@ -218,11 +218,11 @@ class CloudOptions(ViewOptions):
 
 
 def read_table(table: tuple[float, ...]) -> Plane | float:
-    """Return the table as a plane, given four numbers, or as a height [m] along the vertical, given
-    one.
+    """Return the table in the frame of the cloud, from the numbers of the option --table.
 
-    Four numbers are a vector n along the normal, of any length, and d. Points p [m] of the table
-    have n . p = d. Raises `BadArgument` for another count of numbers, or a normal of length zero.
+    One number is a height [m] along z, and is returned as it is. Four numbers give a plane. They
+    are a vector n along the normal, of any length, and d. Points p [m] of the table have n . p = d.
+    Raises `BadArgument` for another count of numbers, or a normal of length zero.
     """
     if len(table) not in (1, 4):
         raise BadArgument(

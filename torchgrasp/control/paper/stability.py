@@ -66,12 +66,12 @@ def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 @checked
 @dataclasses.dataclass(frozen=True)
 class StabilityModel(Value):
-    """The learned stability model of one hand: two Gaussian mixtures over the states of grasps
-    (`state_of`).
+    """The learned stability model of one hand: two Gaussian mixtures over the states of grasps.
 
-    `stable` is the density of stable grasps, `others` that of all others. `share` is the prior
-    probability of stable grasps. `meta` holds texts on the hand, the bodies, trials, seed and
-    scores.
+    A state (`state_of`) has nine numbers. They are the logarithms of three springs' stiffnesses
+    [N/m], three fingertips' distances from their centroid [m], and three forces [N]. `stable` is
+    the density of stable grasps, `others` that of all others. `share` is the prior probability of
+    stable grasps. `meta` holds texts on the hand, the bodies, trials, seed and scores.
     """
 
     stable: GaussianMixture  # density of the states of stable grasps

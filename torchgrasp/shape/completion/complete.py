@@ -95,8 +95,8 @@ class BarNumbers:
     thin: float = 0.012
     """Width [m] below which a part of an object is a bar: that of a fingertip."""
     empty: float = 0.5
-    """Greatest distance of a frame's centre from the outline, inside of it. It is divided by the
-    distance of the centre from the cloud.
+    """Greatest depth of a frame's centre inside the outline, as a share of the centre's distance
+    from the cloud.
     """
     neighbours: int = 30
     """Number of neighbouring points that show the width and direction of a bar, as for fitted
