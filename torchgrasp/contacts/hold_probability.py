@@ -75,8 +75,8 @@ class HoldProbabilityNumbers:
     the memory.
     """
     narrow: float = 1e-4
-    """Length of an interval, in standard deviations, below which it counts as its middle. The
-    difference of Psi would be lost in rounding.
+    """Length of an interval of frictions, in standard deviations, below which it counts as its
+    middle. The difference of an integral at its ends would be lost in rounding.
     """
     parts: int = 2**20
     """Number of pairs of a contact set and a part of the distribution that are computed at a time.

@@ -325,8 +325,9 @@ class ContactProblem:
     constraints in metres; all else is normalised. `friction` is the coefficient of the largest
     round cone inside the friction cone with flat sides that `certify` uses. `domain_radius` is that
     of the shape. `separation` is the least distance of two fingertip centres, and `tip_radius` the
-    radius of the fingertips. `ring` is the radius within which the surface is flat. `table` holds
-    the top of the table, then its side if it has an edge; it is empty without a table. `beyond`
+    radius of the fingertips. `ring` is the radius around a contact within which the surface must be
+    flat. `table` holds the top of the table, then its side if it has an edge. It is empty without
+    a table. `beyond`
     returns the signed distance (q,) of normalised points (q, 3) from the region where contacts may
     be, negative inside.
     """

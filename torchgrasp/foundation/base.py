@@ -334,12 +334,13 @@ def map_rows(
     axes: tuple[int | None, ...],
     arguments: tuple[Tensor, ...],
 ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    """Return the results of a function of several rows (n, ...) under torch.vmap, and the axes of
-    the mapped entries in them.
+    """Return the results of a function for all entries of a torch.vmap at once. Return then the
+    axis of the entries in each result, which is 0.
 
-    It serves as the method `vmap` of a torch.autograd.Function. The rows of all mapped entries are
-    computed in one call. `size` is the number of entries, and `axes` are their axes in the
-    `arguments`. None means that all entries share the argument. In the results this axis is 0.
+    It serves as the method `vmap` of a torch.autograd.Function. `function` takes tensors (n, ...)
+    of n rows, and returns tensors of n rows. The rows of all entries are computed in one call.
+    `size` is the number of entries, and `axes` are their axes in the `arguments`. None means that
+    all entries share the argument.
     """
     parts = [
         x.expand(size, *x.shape) if axis is None else x.movedim(axis, 0)

@@ -314,8 +314,8 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
 
 
 def check_path(name: str, path: Path | str) -> None:
-    """Raise `BadArgument` for a path that no file can have: with a NUL, half a character, or too
-    many bytes.
+    """Raise `BadArgument` for a path that no file can have: with a NUL, half a character (a lone
+    surrogate), or too many bytes.
 
     Errors call the path by `name`.
     """

@@ -61,8 +61,8 @@ class SupportNumbers:
     margin: float = 0.1
     """Distance [m] beside a bowed support at which its surface may not go on at another height."""
     most_away: float = 0.5
-    """Greatest number of points there near the plane but not on it, as a share of those on the
-    support.
+    """Greatest number of points within this margin that are near the plane but not on it. It is a
+    share of the points on the support.
     """
     near: float = 0.08
     """Distance [m] from a target within which a support of its own is sought, if no other carries
@@ -83,8 +83,7 @@ class SupportNumbers:
     over: float = 0.5
     """Least share of a target's points that are above the region of its support."""
     plain: float = 0.75
-    """Share of the score of a point low above a support that is lost on another plane, perhaps a
-    wall.
+    """Share of its score that a point low above a support loses on another plane, perhaps a wall.
     """
     bow: float = 0.010
     """Greatest height [m] of a bowed support above or below the plane that was fitted to a part of

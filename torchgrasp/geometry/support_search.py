@@ -38,8 +38,9 @@ class Target:
     def stands_on(self, support: SupportPlane) -> bool:
         """Return whether the object is over the region of a support, with its foot near the plane.
 
-        More than half of its points are then over the region. Its foot is less than 0.15 m
-        (`SUPPORTS.afloat`) above the plane, or 30 mm (`SUPPORTS.foot`) below it.
+        More than half of its points are then over the region. Its foot, above which 98 % of its
+        points are, is near the plane. It is less than 0.15 m (`SUPPORTS.afloat`) above the plane,
+        or 30 mm (`SUPPORTS.foot`) below it.
         """
         height = support.plane.height(self.points)
         foot = float(height.quantile(SUPPORTS.outliers))
@@ -63,11 +64,11 @@ def find_table(
         viewpoint: position (3,) [m] of the camera.
         table: the table as a plane, or its height [m] along z; None to search for supports.
         up: upward direction, three numbers of any length; None if unknown.
-        target: a thing on the support; None if unknown. Supports that carry it come first.
+        target: the object to grasp; None if unknown. Supports on which it stands come first.
         image_up: upward direction (3,) of the camera's image, as for `find_supports`.
 
-    Raises `BadArgument` for a camera below the table, a table with an edge, or `up` far from the
-    table's normal. Raises `NoSupport` if none is found.
+    Raises `BadArgument` for a camera below the table, or a table with an edge. Raises it also for
+    `up` more than 60 degrees from the table's normal. Raises `NoSupport` if no support is found.
     """
     plane = as_plane(table)
     if plane is not None and plane.edge is not None:

@@ -197,8 +197,8 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """Return a checked grasp on fixed contacts for each contact set with initial guesses (`seeds`),
     best grasp first.
 
-    The two guesses of each set with the least errors are refined. If both fail, the next four are
-    refined.
+    The two guesses of each set with the least cost (`seed_costs`) are refined. If both fail, the
+    next four are refined.
     """
     seeds = problem.drop_unreachable(seeds)
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)

@@ -65,7 +65,8 @@ class ResidualRows(NamedTuple):
     (`SpatialJacobian.twists`). It counts only where `moves` is 1.
     """
 
-    residual: Float[Tensor, "g k"]  # weighted lengths [mm], or weighted errors of cosines
+    # weighted lengths [mm], or weighted errors of the cosines between pads and surface
+    residual: Float[Tensor, "g k"]
     # derivatives of each residual by a translation [m] (3) and a rotation [rad] about the object's
     # origin (3)
     wrench: Float[Tensor, "g k 6"]
@@ -129,9 +130,9 @@ class SpatialJacobian(Value):
 def differentiate(spatial: SpatialJacobian, parts: Sequence[ResidualRows]) -> Residuals:
     """Return (residual, Jacobian) of several groups of residuals, one group after the other.
 
-    `parts` are the groups. The m residuals (g, m) of g hands are lengths [mm], or weighted errors
-    of the cosines between pads and surface. The Jacobian is (g, m, 6 + h). It is by the pose's
-    translation [m] and rotation [rad], then by the h actuated joints. `spatial` holds the
+    `parts` are the groups. The m residuals (g, m) of g hands are weighted. They are lengths [mm],
+    or errors of the cosines between pads and surface. The Jacobian is (g, m, 6 + h). It is by the
+    pose's translation [m] and rotation [rad], then by the h actuated joints. `spatial` holds the
     kinematics of the hands.
     """
     residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))

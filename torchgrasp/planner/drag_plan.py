@@ -161,7 +161,10 @@ def find_drag(
     friction: float,
     table_friction: float,
 ) -> DragPlan | str:
-    """Return the best drag of an object to its table's edge; without one, text with the reason.
+    """Return a drag of an object to its table's edge; without one, a text with the reason.
+
+    It is the first drag that is found. Two pressing tips are tried before one, and the shortest way
+    to the edge before ways aslant.
 
     Args:
         object_: the object on its table, with its estimated shape.

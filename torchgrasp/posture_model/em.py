@@ -218,8 +218,9 @@ def expectation(
 ) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
     """Return (sums, log-likelihood) of all data under m components.
 
-    The sums are the f features of each row, weighted by each component's responsibility for the
-    row. The log-likelihood [nats] is the total of all rows of all processes.
+    The sums are over the data rows x of all processes. What is summed are the f features 1, x_i and
+    x_i x_j of a row. Their weight is each component's responsibility for the row. The
+    log-likelihood [nats] is the total of all rows.
     """
     x = shard.rows
     coefficients = coefficients_from_components(components)
@@ -261,9 +262,11 @@ def features_from_data(
 
 
 def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]:
-    """Return the coefficients of the f features in each component's log joint density.
+    """Return the coefficients of the f features (`features_from_data`) in each component's log
+    joint density.
 
-    This density is log(weight) + log N(x | mean, covariance).
+    This density is log(weight) + log N(x | mean, covariance). It is linear in the features 1, x_i
+    and x_i x_j of a point x.
     """
     means = components.means
     d = means.shape[1]
@@ -289,7 +292,8 @@ def maximisation(
     """Return the maximum-likelihood components, and how often each has collapsed.
 
     Args:
-        sums: features of all rows, weighted by each component's responsibilities.
+        sums: sums over all rows of the f features (`features_from_data`), weighted by each
+            component's responsibilities.
         n: number of rows.
         regularisation: added to every variance.
         reseeded: how often each component has collapsed before.
@@ -340,7 +344,8 @@ def _split_heaviest(components: Components, collapsed: Bool[Tensor, "m"]) -> Com
 
 
 def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: float) -> Components:
-    """Return weights, means and covariances from the weighted sums of the f features of n rows.
+    """Return weights, means and covariances from the weighted sums of the f features
+    (`features_from_data`) of n rows.
 
     `regularisation` is added to every variance. A component without data gets NaN.
     """

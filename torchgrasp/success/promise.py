@@ -26,7 +26,9 @@ BOUNDS = 200  # bounds of the log-odds that are tried, at equal steps
 
 
 class Promise(NamedTuple):
-    """The rule by which a promised share of the returned grasps holds, as trials support it."""
+    """A bound of the predicted success: of the grasps above it, a promised share holds, as trials
+    support.
+    """
 
     least: float  # least predicted log-odds of success of a returned grasp
     trials: int  # number of trials from which this bound was determined
