@@ -99,7 +99,7 @@ class UncertaintyClosing:
       close.
     """
 
-    feels = True
+    feels = True  # sensor readings change the targets
 
     def __init__(self, reference: ClosingReference, options: ClosingOptions) -> None:
         self.reference = reference

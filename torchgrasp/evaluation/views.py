@@ -145,7 +145,7 @@ class ObjectView:
 class PlannedView(NamedTuple):
     """The result of planning on a view."""
 
-    score: ViewScore
+    score: ViewScore  # the score of the view, before any trial
     cloud: PointCloud | None = None  # the cloud of the view [m]; None for a bad object
     grasps: Grasps | None = None  # its executable grasps; None for a bad object
 

@@ -164,9 +164,16 @@ def read_image(
 ) -> DepthImage:
     """Return a checked depth image in float64 [m].
 
-    The arguments are those of `cloud_from_depth`; without a camera pose, the frame is the camera's
-    own. Raises `BadArgument` for arguments of a wrong type, size or unit, and for a pose that is
-    not rigid. It is also raised for a distortion, and for fewer than 30 measured pixels.
+    Args:
+        depth: image (h, w): floats in metres, or integers in millimetres.
+        intrinsics: matrix (3, 3), (fx, fy, cx, cy) [pixels], or another form that
+            `cloud_from_depth` takes.
+        camera_pose: pose `obj_from_camera` (4, 4) [m]; None means the camera's own frame.
+        depth_unit: metres of one count of the depth. None means that of the intrinsics, else the
+            units named under `depth`.
+
+    Raises `BadArgument` for arguments of a wrong type, size or unit, and for a pose that is not
+    rigid. It is also raised for a distortion, and for fewer than 30 measured pixels.
     """
     z, k, _, lens = read_depth(depth, intrinsics, depth_unit=depth_unit)
     if lens is not None:

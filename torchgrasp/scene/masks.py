@@ -36,8 +36,8 @@ class MaskNumbers:
     refused.
     """
     own_share: float = 0.5
-    """Least share of the pixels of a segmented object in the mask, at which the object belongs to
-    the target.
+    """Least share of a segmented object's pixels that are in the mask. With this share or more, the
+    object belongs to the target.
     """
     mask_share: float = 0.3
     """Least share of the mask's pixels above the table that are on one segmented object. With this

@@ -144,7 +144,9 @@ class MujocoScene(SimulatedScene):
         self._mujoco.mj_step1(self.model, self.data)
 
     def joints(self) -> np.ndarray:
-        """Return the positions (j,) [rad or m] of the j driven joints."""
+        """Return the positions (j,) [rad or m] of the j driven joints, in the order of
+        `joint_names`.
+        """
         return self.data.qpos[self._positions]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:

@@ -168,7 +168,9 @@ class SapienScene(SimulatedScene):
         self.body.entity.set_pose(sapien.Pose(pose.p + shift, pose.q))
 
     def joints(self) -> np.ndarray:
-        """Return the positions (j,) [rad or m] of the j driven joints."""
+        """Return the positions (j,) [rad or m] of the j driven joints, in the order of
+        `joint_names`.
+        """
         return np.asarray(self.hand.get_qpos(), float)[self._places]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:

@@ -184,7 +184,9 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def joints(self) -> np.ndarray:
-        """Return the positions (j,) [rad or m] of the j driven joints."""
+        """Return the positions (j,) [rad or m] of the j driven joints, in the order of
+        `joint_names`.
+        """
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:

@@ -80,8 +80,8 @@ class PaperClosing:
     least 0.5 in each finger. The forces have been steady for 0.1 s (`SETTLED`).
     """
 
-    palm = STILL
-    feels = True
+    palm = STILL  # displacement (3,) [m] of the palm from its planned pose: none
+    feels = True  # sensor readings change the targets
 
     def __init__(self, reference: ClosingReference) -> None:
         self.reference = reference.as_printed()
@@ -124,8 +124,8 @@ class PositionClosing:
     0 a finger may stop before it touches.
     """
 
-    palm = STILL
-    feels = True
+    palm = STILL  # displacement (3,) [m] of the palm from its planned pose: none
+    feels = True  # sensor readings change the targets
 
     def __init__(self, reference: ClosingReference, depth: float = POSITION.depth) -> None:
         self.reference = reference
@@ -155,8 +155,8 @@ class OpenLoopClosing:
     targets that press.
     """
 
-    palm = STILL
-    feels = False
+    palm = STILL  # displacement (3,) [m] of the palm from its planned pose: none
+    feels = False  # no sensor reading changes the targets
 
     def __init__(self, reference: ClosingReference) -> None:
         self.reference = reference
