@@ -173,12 +173,14 @@ def way_of(
 def track(
     arm: Arm, start: Float[Tensor, "n g"], tips: Float[Tensor, "3 4 g w"]
 ) -> tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"]]:
-    """Return arm postures along each way, tracked from the grasp both ways, then a mask of the ways
-    without jumps.
+    """Return arm postures [rad or m] along g ways of w poses, then a mask of the ways without
+    jumps.
 
-    `start` are the postures [rad or m] at the grasps, one in each column. `tips` are the w poses (3
-    x 4) [m] of the tip on each way. They are in the frame of the arm's root link. On a way without
-    a jump every pose is reached. No joint moves faster than it can at the hand's speed.
+    A way leads through a grasp. From the grasp, its poses are followed back to its start and on to
+    its end. `start` are the postures [rad or m] at the grasps, one in each column. `tips` are the
+    poses (3 x 4) [m] of the arm's tip on each way. They are in the frame of the arm's root link. On
+    a way without a jump, every pose is reached. The tip moves at 0.1 m/s (`REACH.speed`) there, and
+    no joint exceeds its greatest speed.
     """
     at = COARSE_STEPS + 1
     path = {at: start}

@@ -106,8 +106,9 @@ def parse_urdf(path: Path, data: bytes, visual: bool = False) -> ET.Element:
     """Return the XML tree of a URDF with only links and joints, and with checked numbers.
 
     `data` are the bytes of the file; `path` is named in errors. With `visual`, a link without
-    <collision> has its <visual> in its place. Raises `HandFileError` for malformed XML, for unknown
-    elements, and for numbers that are missing or not finite.
+    <collision> has its <visual> in its place. Known elements of other kinds (`IGNORED`), such as
+    <transmission>, are left out. Raises `HandFileError` for malformed XML, for unknown elements,
+    and for numbers that are missing or not finite.
     """
     # also within comments: a declaration may be hidden by a processing instruction that looks like
     # a comment

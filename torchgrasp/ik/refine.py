@@ -104,10 +104,11 @@ def grasp_residuals(
     """Return the weighted residuals (g, k) of each hand, then their Jacobian (g, k, 6 + h).
 
     They are errors of tip positions [mm] and of cosines of pad directions (no unit; `tip_rows`).
-    With a `world` they are also lacking clearances [mm] (`clearance_rows`). The Jacobian is with
-    respect to the hand's pose (6) and its h joints. `target` [m] holds the wanted tip centres, and
-    `normals` the outward unit normals at the contacts, in the object's frame. With `tips_touch` the
-    fingertips may touch the object and the table.
+    With a `world`, they go on with how far clearances [mm] are below the wanted ones
+    (`clearance_rows`). The Jacobian is with respect to the hand's pose (6) and its h joints.
+    `target` [m] holds the wanted tip centres, and `normals` the outward unit normals at the
+    contacts, in the object's frame. With `tips_touch` the fingertips may touch the object and the
+    table.
     """
     posture = configuration.joints, configuration.obj_from_hand
     if is_world_fused(world, *posture, target, normals):

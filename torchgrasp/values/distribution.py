@@ -102,11 +102,11 @@ class Distribution(Value):
     @classmethod
     @checked
     def read(cls, text: str) -> "float | Distribution":
-        """Return the number or the `Distribution` that a text names, in the form that `parse`
-        explains.
+        """Return the number or the `Distribution` that a text names.
 
-        A text of one number gives a float; `parse` gives a `Distribution` in any case. Raises
-        `BadArgument` for another text.
+        The text is a number "0.5", an interval "0.3:0.8", or several of them with "|" between
+        (`parse`). A text of one number gives a float; `parse` gives a `Distribution` in any case.
+        Raises `BadArgument` for another text.
 
         >>> Distribution.read("0.5"), str(Distribution.read("0.3:0.8"))
         (0.5, '0.3:0.8')

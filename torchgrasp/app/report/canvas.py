@@ -91,7 +91,9 @@ class Framing:
     # x and y that replace those of a vertical direction
     fallback: tuple[float, float] = (1.0, -0.8)
     bar_drop: float = 0.09  # share of the picture that stays empty below for a colour bar
-    squeeze: float = 1.5  # loss of height for each empty share: the share, and half of it above
+    # height that the points lose to the empty share of the picture, over this share: the share below,
+    # and half of it above
+    squeeze: float = 1.5
 
 
 @dataclasses.dataclass(frozen=True)

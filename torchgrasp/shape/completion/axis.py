@@ -77,13 +77,11 @@ class RoundNumbers:
     least_radius: float = 0.01
     """Least radius [m] that is used as this divisor."""
     roundness: float = 0.055
-    """Greatest RMS distance of the normals' lines from a tilted axis, over the radius, without
-    `error`.
+    """Part of a bound that grows with the radius r of the body. The RMS distance of the normals'
+    lines from a tilted axis may be at most sqrt((`roundness` r)^2 + `error`^2).
     """
     error: float = 0.0018
-    """Error [m] in this distance that is the same for all radii; the squares of both parts are
-    added.
-    """
+    """Part [m] of this bound that is the same for all radii."""
     spread: float = 0.075
     """Greatest RMS distance of the normals' lines from the axis of an upright body, over its
     radius.
