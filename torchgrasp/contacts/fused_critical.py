@@ -386,7 +386,8 @@ def search(
 
     The balances of sets that cannot balance mean nothing. `points` (b, f, 3) are the contacts. The
     rows of `axes` (b, f, 3, 3) are the inward normal and two tangents at each contact. `load` (b,
-    6) is the normalised wrench that the contacts balance, as in `least_balance`.
+    6) is the wrench that the contacts balance: force, then torque about their centroid. Its forces
+    are divided by the mean normal force, and its lengths by the contacts' root-mean-square radius.
     """
     b, f = points.shape[:2]
     numbers = critical.CRITICAL

@@ -145,7 +145,12 @@ def close_hand(
 @checked
 @single_threaded
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
-    """Run one trial: close the hand, lift the object and hold it, as `close_hand` explains."""
+    """Run one trial: close the hand, lift the object and hold it; return the record.
+
+    `trial` has the hand, a single grasp and the true object. `spec` are the parameters of the
+    trial; None means `TrialSpec()`. `close_hand` says when the object is held, and lists the
+    errors.
+    """
     return run_lift(TrialDriver(trial, TrialSpec() if spec is None else spec))
 
 
