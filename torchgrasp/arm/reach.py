@@ -84,8 +84,9 @@ def with_arm(
     """Return grasps with the fields `arm` and `ease`, and the status `UNREACHABLE` where the arm
     has no way.
 
-    `arm` holds the joints [rad or m] of the arm at the grasp. `ease` holds the least room of a
-    joint on the way, and the least manipulability (`measure_ease`). Both are 0 without a way
+    `arm` holds the joints [rad or m] of the arm at the grasp. `ease` holds two least numbers on the
+    way (`measure_ease`). First is the distance of a joint from its nearer limit, as a share of half
+    its range. Second is the manipulability [m^3]. Both fields are 0 without a way
     (`follow_grasps`), and for grasps that were not executable. `world` holds what the arm must not
     touch. Without a table there, the grasp is lifted along the unit vector `up`.
     """
@@ -104,14 +105,16 @@ def follow_grasps(
     """Return the arm's postures on its way through each of g grasps: the straight approach, the
     grasp, the lift.
 
-    The first result holds the w postures (g, w, n) [rad or m], zero where there is no way. The
-    second is a mask (g,) of the grasps that have a way. The third (g, 2) holds the least room of a
-    joint on the way, and the least manipulability (`measure_ease`).
+    The first result holds the w postures (g, w, n) [rad or m] of the arm's n joints. It is zero
+    where there is no way. The second is a mask (g,) of the grasps that have a way. The third (g, 2)
+    holds two least numbers on the way (`measure_ease`). First is the distance of a joint from its
+    nearer limit, as a share of half its range. Second is the manipulability [m^3].
 
     On a way the arm stays within its joint limits and does not jump. Its links collide neither with
     the `world`, nor with each other or the palm. Several postures may reach the grasp. The way goes
-    through the easiest one from which the arm can follow all of it. If the `world` has no table,
-    the hand is lifted along the unit vector `up`.
+    through the easiest one from which the arm can follow all of it. The product of these two
+    numbers at the grasp is then the greatest. If the `world` has no table, the hand is lifted along
+    the unit vector `up`.
     """
     poses = way_of(hand, grasps, world, up).to(arm.lower)
     starts = REACH.starts

@@ -36,8 +36,8 @@ class BarrierNumbers:
     knee: float = 0.9
     """Share of the limits of torque and force above which the penalty begins."""
     gap: float = 0.01
-    """Weight of the barrier, as a share of the load and the floors [N]. With a larger one the
-    forces stay farther from the borders of the cones.
+    """Weight of the barrier, as a share of the load and of the fingers' least normal forces [N].
+    With a larger one the forces stay farther from the borders of the cones.
     """
     growth: float = 0.02
     """Least multiple of the internal forces that is tried besides 0; each later one is twice the

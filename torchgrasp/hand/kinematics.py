@@ -179,9 +179,9 @@ class FreeMotion(Value):
     ) -> "FreeMotion":
         """Return the tables for groups of markers.
 
-        A group has link indices, coordinates [m] in the frames of these links, and 1 for points or
-        0 for directions. `coupling` (j, h) is the motion of each movable joint for a unit motion of
-        each actuated joint (`ActuatedJoints.coupling`).
+        A group has link indices, and coordinates [m] in the frames of these links. Its number is 1
+        for points, and 0 for directions. `coupling` (j, h) is the motion of each movable joint for
+        a unit motion of each actuated joint (`ActuatedJoints.coupling`).
         """
         own = flatnonzero((coupling != 0).any(1))
         eye = functools.partial(torch.eye, dtype=tree.axis.dtype, device=tree.axis.device)

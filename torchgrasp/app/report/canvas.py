@@ -91,8 +91,8 @@ class Framing:
     # x and y that replace those of a vertical direction
     fallback: tuple[float, float] = (1.0, -0.8)
     bar_drop: float = 0.09  # share of the picture that stays empty below for a colour bar
-    # height that the points lose to the empty share of the picture, over this share: the share below,
-    # and half of it above
+    # height that the points lose to the empty share of the picture, over this share. They lose the
+    # share below, and half of it above.
     squeeze: float = 1.5
 
 
