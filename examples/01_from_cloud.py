@@ -2,7 +2,7 @@
 out.
 """
 
-from torchgrasp import ContactSpec, Status, fit_shape, load_hand, load_object, plan_grasps
+from torchgrasp import ContactSpec, fit_shape, load_hand, load_object, plan_grasps
 
 cloud = load_object(
     "rabbit"
@@ -15,7 +15,7 @@ std = 1e3 * shape.predict(cloud.points).std_m.median()
 print(f"the surface that the camera saw is known to {std:.1f} mm")
 
 grasps = plan_grasps(cloud, hand, spec, starts=100, shape=shape)
-executable = grasps[grasps.status == Status.OK]
+executable = grasps.executable
 for grasp in executable[:3]:
     print(
         f"success {float(grasp.success):.0%}, clearance {1e3 * float(grasp.clearance):.1f} mm, palm at"

@@ -273,6 +273,7 @@ def test_the_best_grasp_is_the_first_executable_one_or_the_reasons():
         score=torch.tensor([9.0, 2.0, 1.0]).double(),
     )
     assert three.best == three[1] and float(three.best.score) == 2.0
+    assert three.executable == three[1:] and len(three[:1].executable) == 0
     with pytest.raises(FailedRows, match=Status.NOT_CLOSED.sentence[:30]):
         three[:1].best
     with pytest.raises(FailedRows, match="explain_empty"):

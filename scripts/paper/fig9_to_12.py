@@ -16,7 +16,6 @@ from torchgrasp import (
     ContactSpec,
     Grasps,
     Hand,
-    Status,
     list_objects,
     load_hand,
     load_object,
@@ -99,7 +98,7 @@ def take(name: str, hand: Hand, starts: int, seed: int) -> Taken:
 
     view = load_object(name).view
     planned = plan_grasps(view, hand, SPEC, starts, seed, mode="paper", observer=note)
-    return Taken(hand, extract_surface(stages["shape"]), planned[planned.status == Status.OK])
+    return Taken(hand, extract_surface(stages["shape"]), planned.executable)
 
 
 def unlike_pair(taken: Taken) -> tuple[Taken, int, int, float] | None:
@@ -130,7 +129,7 @@ def shared_triple(first: Taken, other: Hand) -> list[tuple[Taken, int]]:
     mixture = load_mixture(other.urdf_path.parent / "paper.safetensors")
     seeds = query_mixture(other, contacts, mixture, n_seeds=1, max_energy=PAPER_ENERGY)
     tried = solve_as_paper(problem, seeds)
-    good = tried[tried.status == Status.OK]
+    good = tried.executable
     if not len(good):
         return []
     apart = contacts.points.mean(1) - good.contacts.points[0].mean(0)

@@ -185,7 +185,7 @@ class _Bench:
         shape = self.shape(view, row.support)
         starts = self.spec.starts
         grasps = plan_grasps(cloud, self.hand, asked, starts, self.spec.seed, shape=shape)
-        return grasps[grasps.status == Status.OK]
+        return grasps.executable
 
     def shape(self, view: str, support: Support) -> ShapeGP:
         """Return the shape of a view."""

@@ -16,7 +16,7 @@ from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data.shipped import DATA, list_objects
 from torchgrasp.evaluation.golden import GOLDEN, run_golden
 from torchgrasp.files import write_file
-from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.values.specs import Simulator
 
 VIEWS = {
@@ -69,7 +69,7 @@ def golden(seed: int = 0) -> None:
     for name, hand_name in sorted({(case.object, case.hand) for case in GOLDEN}):
         view = load_object(name).view
         grasps = plan_grasps(view, load_hand(hand_name), spec, starts=300, seed=seed)
-        grasps[grasps.status == Status.OK][0].save(DATA / name / f"{hand_name}.safetensors")
+        grasps.executable[0].save(DATA / name / f"{hand_name}.safetensors")
     simulators: tuple[Simulator, ...] = ("sapien", "mujoco")
     for simulator in simulators:
         for result in run_golden(simulator):

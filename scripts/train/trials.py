@@ -250,7 +250,7 @@ def _try_body(
     region = draw_half(cloud, draw) if kept else None
     spec = ContactSpec(friction=friction, table=table)
     found = plan_grasps(cloud, hand, spec, STARTS, keep=region)
-    executable = found[found.status == Status.OK]
+    executable = found.executable
     seen = {"sensor": str(sensor), "region": "half" if kept else "none"}
     row = row._replace(executable=len(executable), points=len(cloud), meta=seen)
     if not len(executable):

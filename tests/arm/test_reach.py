@@ -22,7 +22,7 @@ TABLE = CollisionWorld(table=Plane.horizontal(0.0))
 
 @pytest.fixture(scope="module")
 def good(grasps):
-    return grasps[grasps.status == Status.OK]
+    return grasps.executable
 
 
 def test_the_planner_returns_grasps_that_the_arm_reaches(arm, grasps, good):
@@ -193,7 +193,7 @@ def test_without_a_table_the_way_that_the_planner_judges_is_that_of_the_motion(h
     """
     arm = ur5e(hand, (-0.95, 0.0, 0.2))  # almost stretched
     found = plan_grasps(load_object("cylinder").view, hand, starts=8, arm=arm)
-    found = found[found.status == Status.OK]
+    found = found.executable
     joints = plan_motion(arm, hand, found).positions[..., : len(arm.lower)]
     room = torch.minimum(joints - arm.lower, arm.upper - joints) / ((arm.upper - arm.lower) / 2)
     assert len(found) > 3 and torch.allclose(room.flatten(1).amin(1), found.ease[:, 0], atol=1e-4)

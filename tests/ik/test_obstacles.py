@@ -47,7 +47,7 @@ def free(jug_grasps):
 
 
 def executable(grasps):
-    return grasps[grasps.status == Status.OK]
+    return grasps.executable
 
 
 def paths(hand, grasp, rise=0.0):

@@ -16,7 +16,7 @@ from torchgrasp import (
     load_object,
     plan_grasps,
 )
-from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.reasons import explain_success, measure_again, stand_upright
@@ -65,7 +65,7 @@ def success_at(grasps, shape, friction, mass):
 
 def test_the_score_is_that_of_the_mean_success_over_single_frictions_and_masses(planned, one_body):
     grasps, shape = planned
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     assert len(good) >= 3
     single = torch.zeros(len(good), dtype=torch.float64)
     frictions = [*(torch.linspace(0.3, 0.8, 17)[1::2].tolist()), 1.0]  # eight middles, and a number
@@ -125,7 +125,7 @@ def test_contacts_close_at_the_planned_friction_of_the_distribution(planned):
     spec = ContactSpec(FRICTION)
     assert spec.planned_friction == pytest.approx(0.33125)
     assert float(grasps.meta["planned_friction"]) == pytest.approx(0.33125, rel=1e-5)
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     needed = critical_friction(good.contacts.points, good.contacts.normals)
     assert len(good) and bool((needed <= spec.planned_friction + 1e-6).all())
     again = certify(grasps.contacts, spec)

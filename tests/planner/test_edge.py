@@ -11,7 +11,7 @@ from tests import dragged
 from tests.dragged import BOX, DISTANCE, FRICTION, OUTWARD, SIZE, TABLE_FRICTION, VIEW, ending
 from tests.make import load_hand, near, random_motion, real, see
 from tests.settings import other_settings
-from torchgrasp import ContactSpec, GraspTask, Plane, Status
+from torchgrasp import ContactSpec, GraspTask, Plane
 from torchgrasp.foundation.base import named_tensors
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse
@@ -115,7 +115,7 @@ def test_all_else_of_the_hand_keeps_clear_of_object_and_table(found):
 
 def test_grasps_are_of_the_object_where_the_drag_leaves_it(found):
     hand, plan = found
-    good = plan.grasps[plan.grasps.status == Status.OK]
+    good = plan.grasps.executable
     assert len(good)
     assert good.table.describe() == ending(DISTANCE).describe()
     points = good.contacts.points

@@ -11,7 +11,6 @@ from tests.make import closure_margin, load_hand, same_bits
 from tests.pinch import QUICK
 from torchgrasp import (
     ContactSpec,
-    Status,
     TrialSpec,
     close_hand,
     closing_gains,
@@ -45,7 +44,7 @@ def grasps():
 
 def test_four_fingers_touch_their_contacts_and_close(grasps):
     hand = hand_of(grasps)
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     assert hand.finger_names == ALL and grasps.meta["finger_names"] == ",".join(ALL)
     assert len(good) >= 4 and good.contacts.points.shape[1:] == (4, 3)
     assert bool((good.success > 0.5).any())

@@ -46,7 +46,7 @@ def usual() -> Grasps:
 @pytest.mark.promise("N1")
 def test_eq13_every_grasp_passes_an_independent_programme_and_is_within_reach(run):
     _, grasps, _ = run
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     assert len(good) > 0
     # 24 edges: whoever shares no frame with the planner's cone may use a finer one
     for grasp in good:
@@ -55,7 +55,7 @@ def test_eq13_every_grasp_passes_an_independent_programme_and_is_within_reach(ru
         )
         assert margin > 1e-8 and rank == 6
     hand, grasps, _ = run
-    contacts = grasps[grasps.status == Status.OK].contacts
+    contacts = grasps.executable.contacts
     mixture = load_mixture(hand.name)
     assert len(contacts) > 20
     within = mixture.energy(encode_fingertips(contacts.points, contacts.normals)) < DEFAULT_ENERGY
@@ -84,7 +84,7 @@ def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
 
 def test_success_is_what_the_model_says_of_the_features_that_an_explanation_measures_again(run):
     hand, grasps, stages = run
-    best = grasps[grasps.status == Status.OK][:5]
+    best = grasps.executable[:5]
     odds = load_success_model().log_odds(
         measure_again(*stand_upright(best, hand, stages["shape"]), GraspTask())[0]
     )
@@ -98,15 +98,14 @@ def test_a_task_changes_the_predictions_and_not_the_grasps(task):
     shapes = []
     note = lambda stage, text, value: shapes.append(value) if stage == "shape" else None  # noqa: E731
     grasps = plan_grasps(VIEW, hand, SPEC, starts=12, task=task, observer=note)
-    best = grasps[grasps.status == Status.OK]
+    best = grasps.executable
     odds = load_success_model().log_odds(
         measure_again(*stand_upright(best, hand, shapes[0]), task)[0]
     )
     near(best.score, odds, 1e-6)
     assert grasps.meta["task"] == task.describe() != usual().meta["task"]
     first, second = (
-        set(map(tuple, found[found.status == Status.OK].joints.tolist()))
-        for found in (usual(), grasps)
+        set(map(tuple, found.executable.joints.tolist())) for found in (usual(), grasps)
     )
     assert (
         first <= second or second <= first
@@ -163,7 +162,7 @@ def test_grasps_depend_on_the_seed_and_not_on_the_frame_of_cloud_camera_and_tabl
 
 def test_tips_limits_clearances_and_the_specification_hold(run):
     hand, grasps, _ = run
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     assert float(good.tip_error.max()) <= 0.002
     for joints in (good.joints, good.pregrasp):
         hand.check_joints(joints)
@@ -174,7 +173,7 @@ def test_tips_limits_clearances_and_the_specification_hold(run):
     spheres = apply(good.obj_from_hand, hand.sphere_centres(good.joints))
     assert float((spheres[..., 2] - hand.collision_spheres.radius).min()) >= SPEC.table
     _, grasps, stages = run
-    contacts = grasps[grasps.status == Status.OK].contacts
+    contacts = grasps.executable.contacts
     estimate = stages["shape"].predict(contacts.points)
     assert float(estimate.distance.abs().max()) <= 1e-5
     assert float(estimate.variance.max()) <= SPEC.max_variance + 1e-6
@@ -264,7 +263,7 @@ def test_success_is_unknown_where_the_cloud_has_few_points_or_one_flat_face(rows
     grasps = plan_grasps(
         PointCloud(seen, viewpoint=VIEW.viewpoint), load_hand("barrett"), SPEC, starts=20
     )
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     assert len(good) and bool(good.success.isnan().all())
 
 

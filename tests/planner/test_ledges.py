@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from tests.make import load_hand, random_motion, real, same_bits
-from torchgrasp import ContactSpec, Status, load_scene, plan_grasps
+from torchgrasp import ContactSpec, load_scene, plan_grasps
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.foundation.base import named_tensors
 from torchgrasp.foundation.errors import BadArgument
@@ -50,7 +50,7 @@ def ball(centres, radius):
 
 def test_no_sphere_of_an_executable_grasp_is_in_the_table_and_fingers_reach_below_it(over):
     hand, grasps = over
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     assert len(good)
     assert good.table is not None and good.table.describe() == ENDING.describe()
     shrunk = hand.collision_spheres.radius.double() - 1e-4  # the clearances are of single precision
@@ -65,7 +65,7 @@ def test_no_sphere_of_an_executable_grasp_is_in_the_table_and_fingers_reach_belo
 
 def test_round_fingertips_at_the_contacts_are_not_in_the_table(over):
     hand, grasps = over
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     contacts = good.contacts
     radius = hand.tips.radius.double().expand(len(good), -1) - 1e-4
     centres = contacts.points.double() + radius[..., None] * contacts.normals.double()
@@ -104,7 +104,7 @@ def test_an_edge_of_the_specification_takes_the_place_of_a_scenes_table():
     hand = load_hand("barrett")
     grasps = plan_grasps(scene, hand, ContactSpec(table=ending), starts=8)
     assert grasps.table is not None and grasps.table.describe() == ending.describe()
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     assert len(good)
     centres = apply(good.obj_from_hand.double(), hand.sphere_centres(good.joints.double()))
     room = ending.clearance(centres) - hand.collision_spheres.radius.double()

@@ -54,7 +54,7 @@ def test_every_tilt_of_the_weight_is_resisted_and_weaker_grasps_say_so(poured):
     margin = poured.certificate.task_margin
     judged = (poured.status == Status.OK) | (poured.status == Status.NOT_RESISTED)
     assert torch.equal(poured.status[judged] == Status.OK, margin[judged] >= 1)
-    good = poured[poured.status == Status.OK]
+    good = poured.executable
     assert 0 < len(good) < int(judged.sum())
     tilted = directions(300)
     tilted = rotate(FRAME, tilted[tilted[:, 2] < 0.5])  # at most 120 degrees from straight down
@@ -81,7 +81,7 @@ def offset(load):
 
 
 def test_no_drive_gives_more_than_its_torque_for_the_strength_of_a_fingertip(poured):
-    good = poured[poured.status == Status.OK]
+    good = poured.executable
     obj_from_hand = good.obj_from_hand
     jacobian = HAND.jacobian(good.joints, apply(inverse(obj_from_hand), good.contacts.points))
     push = -good.certificate.task_strength[..., None] * rotate(
@@ -227,7 +227,7 @@ def test_a_lift_is_less_likely_where_no_forces_with_all_friction_carry_the_weigh
         for lift in (True, False)
     )
     grasps = plan_grasps(VIEW, HAND, spec, 30, task=GraspTask(mass))
-    grasps = move(grasps[grasps.status == Status.OK], inverse(lifted.each[0].obj_from_upright))
+    grasps = move(grasps.executable, inverse(lifted.each[0].obj_from_upright))
     cloud = torch.zeros(len(grasps), dtype=torch.int64)
     centre = lifted.body.center.double()
     weight = real([0.0, 0.0, -9.81 * mass])

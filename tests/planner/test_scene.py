@@ -33,7 +33,7 @@ def crowded():
 
 def test_no_link_comes_into_a_neighbour_whose_presence_lowers_success_unless_pushed(crowded):
     _, grasps = crowded
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     assert len(good) > 0
     spheres = HAND.collision_spheres
     at = SpatialJacobian.at(HAND, Configuration(good.joints, good.obj_from_hand))
@@ -76,7 +76,7 @@ def test_reachable_is_asked_in_the_given_frame_and_its_word_counts():
         return obj_from_hand[:, 0, 3] > 0.0
 
     grasps = plan_grasps(scene, HAND, starts=16, reachable=reachable)
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     assert len(good) and float(good.obj_from_hand[:, 0, 3].min()) > 0.0
     places = torch.cat(asked)[:, :3, 3]
     assert (

@@ -218,7 +218,7 @@ def lift_from_edge(
     >>> lift_from_edge(plan, hand, box, trial, parts=[box]).held
     True
     """
-    good = plan.grasps[plan.grasps.status == Status.OK]
+    good = plan.grasps.executable
     if not len(good):
         raise BadArgument("plan", "no executable grasp", "at least one")
     solid, pieces = read_solid(*solid_of(mesh, parts))

@@ -227,7 +227,7 @@ def plan_view(
         spent = time.process_time() - started
         bad = {"refusal": Status.BAD_OBJECT, "note": note, "seconds": spent}
         return PlannedView(dataclasses.replace(score, **bad))
-    grasps = found[found.status == Status.OK]
+    grasps = found.executable
     status = found.status if len(found) else stages["plan"].status
     failed = count_status(status[status != Status.OK])
     refusal = Status.OK if len(grasps) else next(iter(failed), Status.OUT_OF_REACH)

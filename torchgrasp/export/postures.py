@@ -160,7 +160,7 @@ def named_postures(
     hand = hand.to("cpu")
     grasps = grasps.to("cpu")
     squeezed = squeeze(hand, grasps, force, kp)
-    _check_executable(hand, grasps[grasps.status == Status.OK])
+    _check_executable(hand, grasps.executable)
     postures = {
         "pregrasp": grasps.pregrasp.double(),
         "grasp": grasps.joints.double(),

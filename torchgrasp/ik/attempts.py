@@ -107,7 +107,7 @@ class Attempts(Generic[Result]):
         return results[first], row[first]
 
 
-def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
+def is_executable(grasps: Grasps) -> Bool[Tensor, "g"]:
     """Return a mask of the grasps that passed every check (`Status.OK`)."""
     return grasps.status == Status.OK
 
@@ -121,7 +121,7 @@ def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
     """
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
-        failed = ~executable(grasps)
+        failed = ~is_executable(grasps)
         bad_contacts = failed & (grasps.status < Status.OUT_OF_REACH)
         return failed.int() + bad_contacts.int(), -grasps.score
 
@@ -130,7 +130,7 @@ def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
 
 def best_first(grasps: Grasps) -> Grasps:
     """Return grasps sorted: executable grasps before failed grasps, both by decreasing score."""
-    return grasps[lexical_order((~executable(grasps)).int(), -grasps.score)]
+    return grasps[lexical_order((~is_executable(grasps)).int(), -grasps.score)]
 
 
 def refine_on_contacts(
@@ -163,7 +163,7 @@ def try_best_seeds(
 
     Each guess is refined on its fixed contacts by at most `steps` solver steps.
     """
-    attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
+    attempts = Attempts(torch.ones_like(problem.certificate.closed), is_executable)
     attempts.refine(
         seeds, rank_in_group(seeds.row), (2,), partial(refine_on_contacts, problem, steps=steps)
     )
@@ -201,7 +201,7 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     next four are refined.
     """
     seeds = problem.drop_unreachable(seeds)
-    attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
+    attempts = Attempts(torch.ones_like(problem.certificate.closed), is_executable)
     rank = rank_in_group(seeds.row, seed_costs(problem, seeds))
     attempts.refine(seeds, rank, (2, 4), partial(refine_on_contacts, problem))
     return best_first(best_grasps(attempts)[0])
@@ -218,6 +218,6 @@ def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     step = COBYLA.together
     for first in range(0, max(min(len(seeds), COBYLA.seeds), 1), step):
         tried.append(refine_on_contacts(problem, seeds[first : first + step], cobyla=True))
-        if int(executable(join(tried)).sum()) >= COBYLA.grasps:
+        if int(is_executable(join(tried)).sum()) >= COBYLA.grasps:
             break
     return best_first(join(tried))

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgrasp.data.accept import HandLike, SeenLike, as_hand, as_seen
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse, rigid
@@ -65,7 +65,7 @@ class EdgePlan(Value):
         0 without an executable grasp, one that passed all checks, and NaN if its success is
         unknown.
         """
-        good = self.grasps[self.grasps.status == Status.OK]
+        good = self.grasps.executable
         if not len(good):
             return 0.0
         sure = 1.0 if self.drag is None else DRAG.ended

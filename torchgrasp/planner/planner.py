@@ -18,7 +18,7 @@ from torchgrasp.foundation.base import join, row_numbers
 from torchgrasp.ik.attempts import (
     Attempts,
     best_grasps,
-    executable,
+    is_executable,
     solve_as_paper,
     solve_contact_first,
     try_best_seeds,
@@ -187,7 +187,7 @@ def solve_fixed(
     contacts, certificate, seeds = rows.select(now)
     reach = objects.reach(contacts, certificate, rows.cloud[now])
     grasps, row = best_grasps(try_best_seeds(reach, seeds, steps))
-    solved = executable(grasps)
+    solved = is_executable(grasps)
     status = torch.where(solved, int(Row.ENDED), int(failed))
     return rows.put(now[row], grasps, status), now[row[solved]]
 
@@ -203,7 +203,7 @@ def solve_with_sliding(
     far, which may be a failed one.
     """
     contacts, certificate, seeds = rows.select(now)
-    attempts = Attempts(torch.ones_like(certificate.closed), executable)
+    attempts = Attempts(torch.ones_like(certificate.closed), is_executable)
     attempts.add(rows.best(now), row_numbers(now))
     reach = objects.reach(contacts, certificate, rows.cloud[now])
     solve_sliding(objects.slide(rows.cloud[now]), reach, seeds, attempts)

@@ -9,7 +9,7 @@ import torch
 
 from torchgrasp.foundation.base import count_status, join
 from torchgrasp.foundation.errors import Status
-from torchgrasp.ik.attempts import executable
+from torchgrasp.ik.attempts import is_executable
 from torchgrasp.planner.objects import Objects
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.values.planning import Grasps, format_success
@@ -96,7 +96,7 @@ class Report:
             return
         self.ended += 1
         if self.ended < self.batches:
-            good = int(executable(grasps).sum())
+            good = int(is_executable(grasps).sum())
             best = f", the best {format_success(grasps)} likely" if good else ""
             text = f"{self.ended} of {self.batches}: {good} executable of {len(grasps)}{best}"
             self.objects.tell("batch", text, grasps)

@@ -14,7 +14,6 @@ import torch
 from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.attempts import executable
 from torchgrasp.planner.objects import Objects, ShapedObject, find_model, pose, pose_request
 from torchgrasp.planner.planner import plan_object
 from torchgrasp.planner.ranking import expected_success, rank_together
@@ -49,7 +48,7 @@ def stream_request(request: Request) -> Iterator[Grasps]:
     batches = list[Grasps]()
     for grasps in _plan_batches(request):
         batches.append(grasps)
-        good = grasps[grasps.status == Status.OK]
+        good = grasps.executable
         if len(good):
             yield good
     finish(request, batches)
@@ -91,7 +90,7 @@ def relax(objects: Objects, batches: Iterator[Grasps], deadline: float) -> Itera
         failed.clear()
         for grasps in attempt:
             failed.append(grasps)
-            good = grasps[executable(grasps)]
+            good = grasps.executable
             if len(good):
                 best = max(best, float(torch.sigmoid(good.score).max()))
                 yield from failed

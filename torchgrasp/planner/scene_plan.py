@@ -229,7 +229,7 @@ def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
         return ThingPlan(
             scene.target, 0.0, reason=str(error), status=stages.get("vague", Status.OK)
         )
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     if len(good):
         return ThingPlan(scene.target, float(good.success[0]), good, shape=stages["shape"])
     funnel = Funnel.of(stages["plan"], stages["certify"], stages["query"], grasps)

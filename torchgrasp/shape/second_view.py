@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgrasp.cloud.camera import look_at
 from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Length, Measured, Pose
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import apply, inverse
@@ -242,7 +242,7 @@ def _contacts(
     """
     if grasps is None:
         return shape.x.new_zeros(0, 3), shape.x.new_zeros(0)
-    good = grasps[grasps.status == Status.OK][: VIEW.grasps]
+    good = grasps.executable[: VIEW.grasps]
     points = good.contacts.points.to(shape.x)
     contacts = apply(inverse(frame).to(points), points.flatten(0, 1))
     inside = shape.contains(contacts)

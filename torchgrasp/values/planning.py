@@ -444,6 +444,11 @@ class Grasps(Batch):
         return torch.where(self.status == Status.OK, likely, 0.0).as_subclass(Probabilities)
 
     @property
+    def executable(self) -> "Grasps":
+        """The grasps that passed all checks (`Status.OK`), in their order; there may be none."""
+        return self[self.status == Status.OK]
+
+    @property
     def best(self) -> "Grasps":
         """The first executable grasp, one that passed all checks, as a batch of one, which all
         functions take.
@@ -452,13 +457,13 @@ class Grasps(Batch):
         `float(best.success)` is a number. Raises `FailedRows` with the reasons if there is no
         executable grasp.
         """
-        good = self.status == Status.OK
         if not len(self):
             raise FailedRows(self.meta.get("refused", "there is no grasp: explain_empty tells why"))
-        return self[good][:1] if bool(good.any()) else self.raise_for_status()
+        good = self.executable
+        return good[:1] if len(good) else self.raise_for_status()
 
     def _about(self) -> list[str]:
-        good = self[self.status == Status.OK]
+        good = self.executable
         best = [f"best predicted success {format_success(good)}"] if len(good) else []
         return [
             f"{len(good)} of {len(self)} executable",

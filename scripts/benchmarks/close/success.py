@@ -22,7 +22,6 @@ from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.evaluation.views import choose_rows
 from torchgrasp.files import sha256
-from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.load import load_hand
 from torchgrasp.success.model import MODEL
@@ -124,7 +123,7 @@ def pull_at(
     contacts = ContactSpec(friction, table=Plane.horizontal(0.0))
     cloud = next(iter(solid.views.values()))
     grasps = plan_grasps(cloud, model, contacts, spec.starts, spec.seed, task=protocol.task)
-    good = grasps[grasps.status == Status.OK]
+    good = grasps.executable
     more = max(len(good) - BEST, 0)
     rest = [BEST + k for k in choose_rows(more, OTHERS, "spread")] if more else []
     tried = list[tuple[int, float, bool]]()

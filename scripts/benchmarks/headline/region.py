@@ -104,7 +104,7 @@ def _compare(
     for chosen in (None, region):
         asked = cloud, hand, contact_spec, spec.starts, spec.seed
         grasps, took = timed(partial(plan_grasps, *asked, keep=chosen))
-        good = grasps[grasps.status == Status.OK]
+        good = grasps.executable
         contacts = good.contacts.points.reshape(-1, 3)
         best.append(good[:1])
         executable.append(len(good))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from benchmarks.common import Options, Row
 from torchgrasp import ContactSpec, load_hand, plan_grasps
-from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.foundation.errors import GraspError
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values.planning import PointCloud
 
@@ -58,7 +58,7 @@ def contact_row(name: str, clouds: dict[str, dict[str, Tensor]], table: float, o
             except GraspError:
                 refused += 1
                 continue
-            good = plan[plan.status == Status.OK]
+            good = plan.executable
             if not len(good):
                 refused += 1
                 continue

@@ -76,7 +76,7 @@ from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.export import format_grasps
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, GraspError, Status
+from torchgrasp.foundation.errors import BadArgument, GraspError
 from torchgrasp.foundation.rules import Fraction, Range, Seed
 from torchgrasp.geometry.frames import inverse, real
 from torchgrasp.geometry.mesh import read_mesh
@@ -684,7 +684,7 @@ class _GraspTool(Tool):
         path = place.file("grasps", self.grasps)
         with naming(path="grasps"):
             grasps = load_grasps(path)
-        good = grasps[grasps.status == Status.OK]
+        good = grasps.executable
         if not self.rank < len(good):
             wanted = f"a rank below {len(good)}, the number of executable grasps in the file"
             raise BadArgument("rank", self.rank, wanted)

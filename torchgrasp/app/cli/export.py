@@ -17,7 +17,7 @@ from torchgrasp.data.shards import load_grasps
 from torchgrasp.export.foreign import read_poses
 from torchgrasp.export.postures import follower_joints, stands_still
 from torchgrasp.files import read_bytes, read_json, write_file
-from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
+from torchgrasp.foundation.errors import BadArgument, ModelFileError
 from torchgrasp.foundation.rules import Count
 from torchgrasp.geometry.mesh import SUFFIXES, load_triangles, read_mesh
 from torchgrasp.hand.hand import Hand
@@ -180,7 +180,7 @@ class Export(Command):
 
     def _choose(self, hand: Hand, planned: Grasps) -> Grasps:
         """Return the best executable grasps that the format can hold, at most `most`."""
-        best = planned[planned.status == Status.OK]
+        best = planned.executable
         if self.format in ("isaac", "moveit"):
             still = stands_still(hand, best)
             if falling := int((~still).sum()):

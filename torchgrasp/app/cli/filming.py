@@ -17,7 +17,7 @@ from torchgrasp.app.cli.results import GRASPS, SURFACE, read_true_mesh, table_un
 from torchgrasp.app.report.moving_picture import Rate, check_kind, write_film
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.evaluation.lift import close_hand
-from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.hand.load import hand_of
 from torchgrasp.values.specs import Simulator, TrialSpec
@@ -59,7 +59,7 @@ class Film(Command):
         file = self.grasps / GRASPS if self.grasps.is_dir() else self.grasps
         with naming(path="GRASPS"):
             planned = load_grasps(file)
-        good = planned[planned.status == Status.OK]
+        good = planned.executable
         if self.rank > len(good):
             allowed = f"at most {len(good)}, the number of executable grasps"
             raise BadArgument("--rank", self.rank, allowed)

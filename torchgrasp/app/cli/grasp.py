@@ -651,7 +651,7 @@ def rank_best(grasps: Grasps) -> float:
 
     It is 0 if the success is unknown, and -1 without such a grasp.
     """
-    best = grasps[grasps.status == Status.OK][:1]
+    best = grasps.executable[:1]
     return max(0.0, *best.success.nan_to_num().tolist()) if len(best) else -1.0
 
 
@@ -659,7 +659,7 @@ def describe_best(grasps: Grasps) -> str:
     """Return a text with the predicted success of the best grasp that passed all checks, or "no
     grasp".
     """
-    best = grasps[grasps.status == Status.OK][:1]
+    best = grasps.executable[:1]
     return f"success {format_success(best)}" if len(best) else "no grasp"
 
 

@@ -11,7 +11,6 @@ from torchgrasp.data.shipped import DATA, list_objects, load_object
 from torchgrasp.export import save_surface
 from torchgrasp.export.play import stand
 from torchgrasp.files import sha256
-from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
@@ -55,7 +54,7 @@ def make_run(
     hand = hand_of(grasps, hand)
     costs = [
         cost.sentence
-        for best in grasps[grasps.status == Status.OK][:1]
+        for best in grasps.executable[:1]
         for cost in explain_success(best, hand, shape, task)
     ]
     surface = extract_surface(shape)
@@ -90,7 +89,7 @@ def find_look(shape: ShapeGP, grasps: Grasps, spec: ContactSpec) -> NextView | N
     more. It is also None if every view leaves at least 0.8 (`HELPS`) of the mean standard deviation
     at the contacts.
     """
-    best = grasps[grasps.status == Status.OK][:1]
+    best = grasps.executable[:1]
     if len(best) and float(best.success[0]) >= ENOUGH:
         return None
     view = next_view(shape, grasps, table=spec.plane)

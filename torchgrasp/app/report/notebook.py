@@ -11,7 +11,7 @@ from torchgrasp.cloud.agreement import check_seen
 from torchgrasp.data.accept import CloudLike, HandLike, as_cloud
 from torchgrasp.files import format_columns
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.foundation.errors import GraspError
 from torchgrasp.foundation.lazy import Image
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import move, upright_frame, upright_table
@@ -101,7 +101,7 @@ def show_in_notebook(grasps: Grasps) -> str:
 
 def _make(grasps: Grasps, cloud: PointCloud | None, hand: Hand | None) -> GraspSheet:
     """Return table and picture; without a hand there is no picture."""
-    best = grasps[grasps.status == Status.OK]
+    best = grasps.executable
     picture = None
     if hand is not None and len(best):
         picture = _shrink(_draw(best[:1], cloud, hand))

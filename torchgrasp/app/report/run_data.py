@@ -85,7 +85,7 @@ class Run:
     @property
     def executable(self) -> Grasps:
         """The grasps that passed every check, best first."""
-        return self.grasps[self.grasps.status == Status.OK]
+        return self.grasps.executable
 
     @property
     def title(self) -> str:
