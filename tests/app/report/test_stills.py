@@ -49,6 +49,14 @@ def test_stills_have_their_size_show_something_and_are_reproducible(run):
     assert draw_cloud(run.cloud, run.spec.table) == stills["cloud"]
 
 
+def test_the_picture_of_contacts_holds_their_arrows_whole(run):
+    low = dataclasses.replace(run.surface, vertices=0.5 * run.surface.vertices)
+    for direction in ((1.0, 0.0, 0.4), (0.0, 1.0, 0.4)):
+        pixels = decode(draw_contacts(low, run.grasps.contacts, direction))
+        for border in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]):
+            assert np.abs(border - pixels[0, 0]).max() < 0.01
+
+
 def test_fingers_are_drawn_in_three_hues(run):
     pixels = decode(draw_grasp(run.surface, run.hand, run.grasps, facing(run.grasps)))
     red = pixels[..., 0]

@@ -105,9 +105,9 @@ def draw_contacts(
     """
     canvas = paint.Canvas()
     vertices = _add_object(canvas, surface, transparent=True)
-    _add_contacts(canvas, contacts)
+    ends = _add_contacts(canvas, contacts)
     canvas.add_table(vertices, table)
-    return canvas.render_png(vertices, direction)
+    return canvas.render_png(np.concatenate([vertices, ends]), direction)
 
 
 def draw_grasp(
@@ -309,13 +309,14 @@ def _add_object(
     return vertices
 
 
-def _add_contacts(canvas: paint.Canvas, contacts: Contacts) -> None:
+def _add_contacts(canvas: paint.Canvas, contacts: Contacts) -> Float[np.ndarray, "f 3"]:
     """Add an arrow along the normal of each contact of the first grasp, in the colour of its
-    finger.
+    finger; return the ends of the arrows [m].
     """
     points = to_array(contacts.points[0])
     normals = to_array(contacts.normals[0])
     canvas.add_arrows(points, normals, STILLS.contact_arrow, paint.FINGERS[: len(points)])
+    return points + STILLS.contact_arrow * normals
 
 
 def add_solids(canvas: paint.Canvas, solids: list[Solid]) -> None:
