@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from torchgrasp import load_scene, read_scene, save_scene
-from torchgrasp.cloud import read_cloud_file
+from tests.make import cup
+from torchgrasp import Scene, load_scene, read_scene, save_scene
+from torchgrasp.cloud import look_at, read_cloud_file
+from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.foundation.errors import BadArgument, CloudFileError
 from torchgrasp.scene.image import is_scene
 
@@ -21,6 +23,21 @@ def test_the_target_of_a_saved_scene_comes_back(tmp_path):
     for target in (None, 3, scene.things[0]):
         chosen = scene if target is None else scene.select(target)
         assert read_scene(save_scene(chosen, tmp_path / "scene.npz")).target == target
+
+
+def test_masks_of_objects_that_the_library_found_are_not_noted(tmp_path):
+    dish = cup(0.006, radius=0.09, floor=0.002)
+    depth, _ = render_depth([dish], look_at(20.0, 55.0, 0.5), noise=False)
+    half = INTRINSICS / 2
+    half[2, 2] = 1.0
+    scene = Scene.from_depth(depth[::2, ::2], half)
+    path = save_scene(scene, tmp_path / "scene.npz")
+    assert read_scene(path) == scene and read_scene(path).notes == scene.notes == ()
+    # the same labels as a user's lose the pixels of the floor
+    np.savez(path, **dict(np.load(path)) | {"given": np.array(scene.things)})
+    own = read_scene(path)
+    assert any("lie on the support" in note for note in own.notes)
+    assert own.rows_of(1).sum() < scene.rows_of(1).sum()
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.limits import SHOWN_LETTERS
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import read_arrays
-from torchgrasp.scene.masks import read_labels
+from torchgrasp.scene.masks import read_labels, without_masks
 from torchgrasp.scene.scene import Scene
 
 
@@ -90,12 +90,14 @@ def scene_of(
 
 
 def _with_found(scene: Scene, labels: Int[Tensor, "h w"], given: np.ndarray) -> Scene:
-    """Return the scene with the saved `labels` of those objects whose labels are not `given`. The
-    library found their pixels, and none of them is on the table.
+    """Return the scene with the saved `labels` of those objects whose labels are not `given`, and
+    without notes on their masks. The library found their pixels, and none of them is on the table.
     """
     saved = labels[tuple(scene.pixels.T)]
     found = (saved > 0) & ~torch.isin(saved, torch.from_numpy(given))
-    return dataclasses.replace(scene, labels=torch.where(found, saved, scene.labels))
+    restored = tuple(saved[found].unique().tolist())
+    notes = without_masks(scene.notes, restored)
+    return dataclasses.replace(scene, labels=torch.where(found, saved, scene.labels), notes=notes)
 
 
 @checked

@@ -315,16 +315,24 @@ def _trim_labels(
     left = count_labels(own[kept > 0], len(names))
     for k, *counts, rest in zip(*(x.tolist() for x in (names, lost, seen, left)), strict=True):
         if k > 0:
-            notes += _removed(f"mask {k}", *counts)
+            notes += _removed(_mask_name(k), *counts)
         # as given masks of one object: this one is the table
         if k > 0 and 0 < rest < MASKS.least_share * counts[1] and 2 * counts[0] > counts[1]:
-            notes.append(f"mask {k}: its other {rest} pixels were removed, too: it is the support")
+            notes.append(
+                f"{_mask_name(k)}: its other {rest} pixels were removed, too: it is the support"
+            )
             kept = torch.where(kept == k, 0, kept)
     if not bool((kept > 0).any()):
         raise BadArgument(
             "labels", "none that rises above the table", "labels of objects on the table"
         )
     return kept, tuple(notes)
+
+
+def without_masks(notes: tuple[str, ...], labels: tuple[int, ...]) -> tuple[str, ...]:
+    """Return the notes of `label_image` without those on the masks of `labels`."""
+    heads = tuple(f"{_mask_name(label)}:" for label in labels)
+    return tuple(note for note in notes if not note.startswith(heads))
 
 
 def label_again(
@@ -426,6 +434,11 @@ def _shifted(mask: Bool[Tensor, "h w"], target: Bool[Tensor, "h w"]) -> list[str
         if count
     ]
     return [f"mask: it fits its object {' and '.join(place)}: align it with the depth image"]
+
+
+def _mask_name(label: int) -> str:
+    """Return the name of the mask of a label in notes."""
+    return f"mask {label}"
 
 
 def _removed(mask: str, count: int, seen: int, where: str = "the support") -> list[str]:
