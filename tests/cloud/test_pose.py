@@ -226,6 +226,7 @@ def test_right_poses_raise_no_alarm():
         degrees = math.degrees(math.acos(float((tilted @ inverse(pose))[2, 2])))
         (note,) = found.notes
         assert abs(float(re.findall(r"tilted by (\d+) degrees", note)[0]) - degrees) < 1
+        assert note.endswith("if z is not up, give `up`")
     assert not right().notes
     assert len(Scene.from_depth(depth, HALF).things) == 2  # the camera's own frame
     beside = rigid(

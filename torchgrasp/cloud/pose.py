@@ -483,7 +483,7 @@ def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
     if tilt < POSE.told:
         return ()
     wrong = "a wrong camera_pose or focal length, or depth that is no distance, such as a z-buffer"
-    fixes = f"if z is up, {wrong}, tilts it; if not, give up"
+    fixes = f"if z is up, {wrong}, tilts it; if z is not up, give `up`"
     return (f"the table is tilted by {tilt:.0f} degrees from z of camera_pose: {fixes}",)
 
 
