@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import pytest
 
 from tests.scores import SCORES
-from torchgrasp import __version__
+from torchgrasp import __version__, load_scene
 from torchgrasp.app.report.evaluation_page import format_evaluation, write_evaluation
 from torchgrasp.app.report.page import TEMPLATES, format_page, write_report
 from torchgrasp.app.report.run_data import closing_sentence, grasp_rows, refusal, verdict
@@ -106,6 +106,9 @@ def test_verdicts(run):
     assert sentence.endswith(f"did not hold the ball: {Status.DROPPED.sentence}.")
     planned = dataclasses.replace(run, closure=None)
     assert verdict(planned) == "The allegro hand has 1 executable grasp of the ball."
+    among = dataclasses.replace(planned, object_name="object 4", scene=load_scene())
+    assert verdict(among) == "The allegro hand has 1 executable grasp of object 4."
+    assert among.title == "Grasps of object 4 with the allegro hand"
     none = dataclasses.replace(planned, grasps=run.grasps[1])
     assert f"1 of 1 postures: {Status.TIP_ERROR.sentence}" in verdict(none)
     unplanned = dataclasses.replace(none, grasps=run.grasps[:0])

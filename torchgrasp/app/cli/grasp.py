@@ -441,9 +441,9 @@ class Grasp(ForPrograms):
         scene = self._read_scene(path)
         progress = StageProgress("scene", *["fingers"] * (among is not None), *STAGES, "report")
         with progress.bar, inputs.holding("--out", out):
-            progress.end(
-                "scene", f"{len(scene.things)} objects, labels {', '.join(map(str, scene.things))}"
-            )
+            labels = ", ".join(map(str, scene.things))
+            several = "s" * (len(scene.things) != 1)
+            progress.end("scene", f"{len(scene.things)} object{several}, label{several} {labels}")
             inputs.print_notes(scene.notes)
             advice = list(scene.advice)
             if scene.target is not None:

@@ -90,7 +90,12 @@ class Run:
     @property
     def title(self) -> str:
         """The title of the run's pages, which names the object and the hand."""
-        return f"Grasps of the {self.object_name} with the {self.hand.name} hand"
+        return f"Grasps of {self.named_object} with the {self.hand.name} hand"
+
+    @property
+    def named_object(self) -> str:
+        """The object in a sentence: "the jug", or "object 4" of a scene, whose name is a number."""
+        return self.object_name if self.scene is not None else f"the {self.object_name}"
 
     @property
     def good(self) -> bool:
@@ -144,13 +149,12 @@ def verdict(run: Run) -> str:
     what would help.
     """
     hand = run.hand.name
-    name = run.object_name
     if run.closure is not None:
         return closing_sentence(run)
     count = len(run.executable)
     if count:
         grasps = "grasp" if count == 1 else "grasps"
-        return f"The {hand} hand has {count} executable {grasps} of the {name}."
+        return f"The {hand} hand has {count} executable {grasps} of {run.named_object}."
     advice = "" if run.explanation is None else f" {run.explanation.advice}"
     return refusal(run) + advice
 
@@ -167,12 +171,12 @@ def closing_sentence(run: Run) -> str:
     assert closure is not None and mesh is not None
     if not closure.held:
         reason = closure.status.sentence
-        return f"The {run.hand.name} hand did not hold the {run.object_name}: {reason}."
+        return f"The {run.hand.name} hand did not hold {run.named_object}: {reason}."
     centre = real([*mesh.center_mass, 1.0])
     rise = float((closure.object_pose[-1] - closure.object_pose[0])[2] @ centre)
     moved, angle = closure.object_motion
     return (
-        f"The {run.hand.name} hand held the {run.object_name}: lifted {rise:.2f} m, "
+        f"The {run.hand.name} hand held {run.named_object}: lifted {rise:.2f} m, "
         f"moved {1e3 * moved:.0f} mm and {math.degrees(angle):.0f} deg in the hand."
     )
 
@@ -212,7 +216,7 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
 
 def refusal(run: Run) -> str:
     """Return one sentence that says why no grasp is executable: each reason with its count."""
-    head = f"The {run.hand.name} hand has no executable grasp of the {run.object_name}"
+    head = f"The {run.hand.name} hand has no executable grasp of {run.named_object}"
     if len(run.grasps):
         failed = run.grasps.status
         total = f"{len(run.grasps)} postures"
