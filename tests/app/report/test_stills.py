@@ -21,6 +21,7 @@ from torchgrasp.app.report.stills import (
     draw_cloud,
     draw_contacts,
     draw_grasp,
+    draw_hand,
     draw_surface,
     facing,
     view_of,
@@ -102,6 +103,21 @@ def test_every_fingertip_belongs_to_its_finger_and_the_palm_to_none():
         fingers = finger_of_links(hand)
         assert [fingers[tip] for tip in hand.tips.links] == [0, 1, 2]
         assert fingers[hand.tree.link_names[0]] == PARKED
+
+
+def test_the_ranges_of_joints_have_a_margin_on_both_sides(monkeypatch):
+    hand = load_hand("allegro")
+    white = io.BytesIO()
+    Image.new("RGB", (8, 8)).save(white, "PNG")
+    monkeypatch.setattr("torchgrasp.app.report.stills.draw_posture", lambda *_: white.getvalue())
+    drawn = []
+    monkeypatch.setattr(
+        "torchgrasp.app.report.canvas.encode_figure", lambda figure: drawn.append(figure) or b""
+    )
+    draw_hand(hand, hand.lower)
+    (axis,) = drawn[0].subfigs[1].axes
+    left, right = np.deg2rad(axis.get_xlim())
+    assert left < float(hand.lower.min()) and right > float(hand.upper.max())
 
 
 def test_solids_follow_the_pose_rigidly_whatever_the_order_of_the_joints_and_lie_at_the_tip():

@@ -186,6 +186,7 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
     axis.set_xlabel("ranges of the joints [degrees], the posture as a mark", color=paint.INK)
     axis.invert_yaxis()
     axis.grid(axis="x", color=paint.GRID)
+    axis.use_sticky_edges = False  # else a bar's lower end gets no margin
     axis.margins(x=SHEET.margin)
     axis.set(axisbelow=True, facecolor=paint.PAPER)
     axis.spines[:].set_visible(False)
