@@ -151,8 +151,10 @@ def test_a_mesh_that_falls_over_is_told(tmp_path):
 
 
 def test_no_meshes_two_of_a_name_and_an_open_one_are_refused(tmp_path: Path):
-    with pytest.raises(BadArgument, match="meshes"):
+    with pytest.raises(BadArgument, match="without meshes"):
         write_objects(tmp_path, tmp_path / "out")
+    with pytest.raises(BadArgument, match="none, which is no folder"):
+        write_objects(tmp_path / "none", tmp_path / "out")
     box = trimesh.creation.box((0.06, 0.08, 0.1))
     for suffix in ("stl", "ply"):
         box.export(tmp_path / f"box.{suffix}")

@@ -185,7 +185,10 @@ def write_objects(
     files = sorted(path for path in Path(meshes).glob("*") if path.suffix.lower() in SUFFIXES)
     names = [path.stem for path in files]
     if not files or len(set(names)) != len(names):
-        found = f"{meshes} without meshes" if not files else f"{meshes} with two meshes of one name"
+        found = f"{meshes} with two meshes of one name"
+        if not files:
+            missing = "without meshes" if Path(meshes).is_dir() else "which is no folder"
+            found = f"{meshes}, {missing}"
         allowed = f"a folder of files {', '.join(SUFFIXES)}, each of its own name"
         raise DatasetError("meshes", found, allowed)
     generator = torch.Generator().manual_seed(seed)
