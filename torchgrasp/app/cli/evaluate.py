@@ -59,6 +59,8 @@ from torchgrasp.values.specs import ClosingMode, HoldingMode, Simulator
 NAME_WIDTHS = (12, 6)  # of the names of object and view, where their longest is not known yet
 COUNT_WIDTHS = (5, 7, -1)  # of executable grasps, of passed ones, and of reasons
 COUNT_HEADS = ("exec.", "passed", "why others did not pass")  # titles of these columns
+# title of the last column where fingertips were measured, too
+TOUCH_HEAD = "fingertips before any force, and why others did not pass"
 OBJECTS_HELP = (
     "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"
 )
@@ -233,7 +235,7 @@ class Evaluate(_Trials, ForPrograms):
         found = evaluate(self.objects, hand, test, spec, folder=folder, workers=self.workers)
         names = list_names(self.objects, spec)
         widths = max(len(ascii(name)) for name, _ in names), max(len(view) for _, view in names)
-        _print_cells(("object", "view", *COUNT_HEADS), widths)
+        _print_cells(("object", "view", *COUNT_HEADS[:-1], TOUCH_HEAD), widths)
         scores = []
         with make_bar(sum(view != "" for _, view in names), "view") as bar:
             for score in found:
