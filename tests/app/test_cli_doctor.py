@@ -50,7 +50,7 @@ def test_what_one_command_needs_is_told_and_is_no_fault(monkeypatch, capsys):
     monkeypatch.setattr(importlib.metadata, "version", without_dask)
     assert cli.main(["doctor"]) == code
     assert (
-        "`torchgrasp campaign --scheduler` needs it: pip install 'torchgrasp[cluster]'"
+        "for `torchgrasp campaign --scheduler`: pip install 'torchgrasp[cluster]'"
         in capsys.readouterr().out
     )
 

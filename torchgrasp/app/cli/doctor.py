@@ -71,7 +71,8 @@ class Doctor(ForPrograms):
         answer({"complete": not missing, "parts": [x._asdict() for x in findings]})
         for x in missing:
             print(f"\n{x.part}: {x.fix}")
-        print("\neverything is installed; `torchgrasp selftest` tries it" if not missing else "")
+        complete = "planning and simulation are complete; `torchgrasp selftest` tries them"
+        print("" if missing else f"\n{complete}")
         return 1 if missing else 0
 
 
@@ -124,7 +125,7 @@ def _extra(extra: str, names: list[str]) -> Finding:
     absent = [state.part for state in states if state.fix]
     found = ", ".join(f"{state.part} {state.found}" for state in states if not state.fix)
     if absent:
-        need = f"; {NEEDED_BY[extra]} needs it" if extra in NEEDED_BY else ""
+        need = f", for {NEEDED_BY[extra]}" if extra in NEEDED_BY else ""
         fix = f"pip install 'torchgrasp[{extra}]'"
         found = f"no {', '.join(absent)}{need}: {fix}"
     return Finding(f"extra {extra}", found)
