@@ -433,6 +433,15 @@ def test_malformed_content_is_refused_by_name(tmp_path, suffix, content):
         read_cloud(tmp_path / f"a{suffix}")
 
 
+def test_for_a_depth_image_the_command_is_named_that_takes_one(tmp_path):
+    np.save(tmp_path / "depth.npy", np.ones((480, 640)))
+    for name in ("depth.png", "depth.npy"):
+        with pytest.raises(CloudFileError, match="`torchgrasp cloud scene` makes a scene"):
+            read_cloud(tmp_path / name)
+    with pytest.raises(CloudFileError, match=r"expected a file ending in .ply[^`]*$"):
+        read_cloud(tmp_path / "scan.docx")
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".npz", ".npy", ".pcd", ".xyz", "_packed.pcd"])
 def test_spoilt_or_truncated_bytes_are_refused_by_name_or_read(tmp_path, points, suffix):
     path = tmp_path / f"a{suffix}"

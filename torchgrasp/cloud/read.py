@@ -32,6 +32,9 @@ TEXTS = (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb")  #
 SUFFIXES = (".ply", ".pcd", ".npz", ".npy", *TEXTS)
 ARRAYS = ("points", "normals", "viewpoint", "frustum", "pose_error", "table")
 """Arrays of a .npz file that are read."""
+IMAGES = (".png", ".tif", ".tiff", ".exr")
+OF_IMAGE = "; of a depth image `torchgrasp cloud scene` makes a scene"
+"""Suffixes of depth images, and what to do with one."""
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length [m] of each unit of files."""
 
@@ -197,7 +200,8 @@ def read_cloud_file(
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        allowed = f"a file ending in {', '.join(SUFFIXES)}"
+        hint = OF_IMAGE if suffix in IMAGES else ""
+        allowed = f"a file ending in {', '.join(SUFFIXES)}{hint}"
         raise CloudFileError("path", path, allowed)
     refuse = functools.partial(CloudFileError, "path")
     data = read_bounded(path, CLOUD_BYTES, f"a {suffix} file", refuse)
@@ -404,6 +408,7 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
     if table.ndim not in (2, 3) or table.shape[-1] not in (3, 6) or table.dtype.kind not in "fiu":
         found = f"{source}: an array of shape {table.shape} and type {table.dtype}"
         allowed = "real numbers of shape (n, 3) or (n, 6), or (h, w, 3) or (h, w, 6) of an image"
+        allowed += OF_IMAGE if table.ndim == 2 else ""
         raise CloudFileError("path", found, allowed)
     split = {**arrays, "points": table[..., :3]}
     if table.shape[-1] == 6:
