@@ -137,6 +137,10 @@ def test_the_command_writes_both_names_what_is_wrong_and_no_grasps_are_an_empty_
     assert cli.main([*words, "--format", "mujoco"]) == 0 and (
         tmp_path / "out"
     ).read_text().startswith("<mujoco")
+    # the folder of `torchgrasp grasp` names its file
+    assert cli.main(["export", str(tmp_path), "--out", str(tmp_path / "again")]) == 0
+    assert cli.main(words) == 0
+    assert (tmp_path / "again").read_bytes() == (tmp_path / "out").read_bytes()
     wrong = {"--hand": "barrett", "--force": "-1", "--most": "0", "--kp": "0"}
     for named, value in wrong.items():
         more = [named, value]

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
-from torchgrasp.app.cli.results import SURFACE
+from torchgrasp.app.cli.results import GRASPS, SURFACE
 from torchgrasp.app.report.glb import write_glb
 from torchgrasp.cloud.agreement import check_contacts
 from torchgrasp.data.shards import load_grasps
@@ -50,7 +50,7 @@ class Export(Command):
     """
 
     grasps: Path = positional(
-        "grasps.safetensors of `torchgrasp grasp`, or a file of the folder grasps of `evaluate`"
+        "grasps.safetensors of `torchgrasp grasp`, or its folder, or a file of `evaluate`"
     )
     out: Path = required("file to write; for dexgraspbench, play-... and usd a folder")
     format: Literal[
@@ -123,7 +123,8 @@ class Export(Command):
 
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return 0, or 1 for no grasp."""
-        surface = self.grasps.with_name(SURFACE)
+        file = self.grasps / GRASPS if self.grasps.is_dir() else self.grasps
+        surface = file.with_name(SURFACE)
         replaced = (self._plays or self.format == "glb") and surface.is_file()
         if self._needs_object and self.object is None and not replaced:
             raise BadArgument("--object", None, f"a path with --format {self.format}")
@@ -134,7 +135,7 @@ class Export(Command):
         if unused := [name for name in (*robot, *trial) if name not in taken]:
             raise BadArgument(unused[0], f"--format {self.format}", "a format that it is for")
         with naming(path="GRASPS"):
-            planned = load_grasps(self.grasps)
+            planned = load_grasps(file)
         hand = hand_of(planned, self.hand)
         if planned.meta.get("hand_sha256") != hand.source.sha256:
             other = f"{hand.name}, whose files are not those that were planned with"
