@@ -106,7 +106,8 @@ def test_a_camera_without_frames_is_not_awaited_for_ever(found):
         ([], "CLOUD: expected one input"),
         (["jug", "--realsense"], "jug beside --realsense"),
         (["jug", "--serial", "3"], "--serial: expected"),
-        (["--realsense", "--mode", "paper"], "an option of clouds beside a scene"),
+        (["--realsense", "--mode", "paper"], "--mode: expected the cloud of one object"),
+        (["--realsense", "--close", "--unit", "mm"], "--close, --unit: expected the cloud of one"),
     ],
 )
 def test_options_of_the_camera_are_checked_before_any_work(words, told, tmp_path, run_command):

@@ -209,22 +209,29 @@ class Grasp(ForPrograms):
         if scene:
             if self.label is not None and self.point is not None:
                 raise BadArgument("--point", "--label beside it", "one of the two")
-            free: dict[str, Any] = {"table": None, "up": None}
-            # the pose of a live camera is part of its scene
-            if self.realsense:
-                free["camera_pose"] = None
-            other = vars(self.view) | free != vars(inputs.CloudOptions())
-            if self.mesh or other or self.mode != "joint" or self.time_budget:
-                options = (
-                    "--label or --point, --table, --up, --hand, --fingers, --out, --seed, "
-                    "--starts, --friction"
-                )
-                raise BadArgument("CLOUD", "an option of clouds beside a scene", options)
+            if unfit := self._of_clouds_alone():
+                found = "a scene" if self.cloud is None else f"the scene {self.cloud}"
+                raise BadArgument(", ".join(unfit), found, "the cloud of one object beside it")
         elif self.label is not None or self.point is not None:
             wanted = "a .npz file with depth and intrinsics"
             raise BadArgument("--label, --point", f"{self.cloud}, which is no scene", wanted)
         elif self.time_budget is not None and not self.time_budget >= LEAST_BUDGET:
             raise BadArgument("--time-budget", self.time_budget, "at least 0.001 seconds")
+
+    def _of_clouds_alone(self) -> list[str]:
+        """Return the names of the given options that a scene does not take."""
+        given = {
+            "mesh": self.mesh is not None,
+            "close": self.close,
+            "mode": self.mode != "joint",
+            "time-budget": self.time_budget is not None,
+        }
+        usual = vars(inputs.CloudOptions())
+        # the pose of a live camera is part of its scene
+        taken = {"table", "up", *["camera_pose"] * self.realsense}
+        for name, value in vars(self.view).items():
+            given[name.replace("_", "-")] = name not in taken and value != usual[name]
+        return [f"--{name}" for name, is_given in given.items() if is_given]
 
     def _check_edge(self, scene: bool) -> None:
         """Raise `BadArgument` for --edge beside an option that the drag does not take."""
