@@ -34,8 +34,8 @@ def test_check_cloud_returns_a_good_cloud_itself():
     ("factor", "words"),
     [
         *[
-            (1e-6, "normalised"),
-            (0.04, "normalised"),
+            (1e-6, "normalised, or in m .--unit m"),
+            (0.04, "normalised, or in m .--unit m"),
             (25.0, "whole scene.*--unit cm"),
             (60.0, "whole scene.*--unit cm"),
             (110.0, "cloud in cm.*--unit cm"),

@@ -222,7 +222,7 @@ def _guess_unit(extent: float) -> str:
     45 cm long.
     """
     if extent < MIN_EXTENT:
-        return "normalised"
+        return "normalised, or in m (--unit m)"
     in_cm = f"in cm ({extent / 100.0:.3g} m: --unit cm)"
     if extent < CLOUD.scene:
         return f"a whole scene (torchgrasp cloud cut), or {in_cm}"
