@@ -164,6 +164,15 @@ def test_the_page_of_an_evaluation_shows_shares_objects_and_reasons_and_no_text_
     )
 
 
+def test_settings_of_a_group_have_a_row_each():
+    asked = {"hand": "barrett", "protocol": {"name": "quick", "trial": {"max_force": None}}}
+    page = format_evaluation("Grasps", asked, SCORES)
+    _, words = read(page)
+    assert words.split("Settings")[1].split() == (
+        "what value hand barrett protocol: name quick protocol: trial: max force -".split()
+    )
+
+
 def test_a_report_says_version_command_and_date_of_its_run(run):
     told = dataclasses.replace(run, command="torchgrasp grasp jug", date="2026-01-02 03:04 UTC")
     page = format_page(told, {})

@@ -81,8 +81,20 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
         figures=list_figures(summary),
         success=_describe_prediction(summary["success"]),
         bins=_bin_rows(summary["success"]),
-        asked=[(name.replace("_", " "), str(value)) for name, value in asked.items()],
+        asked=_setting_rows(asked),
     )
+
+
+def _setting_rows(asked: Mapping[str, object], within: str = "") -> list[tuple[str, str]]:
+    """Return a table row for each setting; those of a group begin with its name, `within`."""
+    rows = []
+    for name, value in asked.items():
+        title = f"{within}{name.replace('_', ' ')}"
+        if isinstance(value, Mapping):
+            rows += _setting_rows(value, f"{title}: ")
+        else:
+            rows.append((title, "-" if value is None else str(value)))
+    return rows
 
 
 def _describe_prediction(success: Mapping[str, Any] | None) -> str | None:
