@@ -64,7 +64,10 @@ TOUCH_HEAD = "fingertips before any force, and why others did not pass"
 OBJECTS_HELP = (
     "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"
 )
-PROTOCOL_HELP = "the test that decides on success; see torchgrasp.evaluation.protocols"
+PROTOCOL_HELP = (
+    "the test that decides on success. multidex, dexgraspbench and pose-noise pull at a floating "
+    "object; the others lift it from a table. See torchgrasp.evaluation.protocols"
+)
 Protocol = Literal[
     "multidex",
     "dexgraspbench",
