@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy import ndimage
 
 from torchgrasp import Scene, load_scene
 from torchgrasp.app.report import draw_scene
@@ -193,6 +194,15 @@ def test_only_a_target_has_a_white_rim(painted):
     chosen = dataclasses.replace(painted, target=1)
     white = [(decode(encode_scene(s))[:900] == 1).all(-1).sum() for s in (painted, chosen)]
     assert white[1] > white[0] + 3000
+
+
+def test_the_white_rim_of_a_target_hides_none_of_it(painted):
+    body = sort_pixels(painted)[1] == 1
+    # its middle has a white number
+    row, column = np.nonzero(body & ~ndimage.binary_erosion(body, iterations=3))
+    pixels = decode(encode_scene(dataclasses.replace(painted, target=1)))
+    middle = 1200 / SHAPE[1] * (np.stack([row, column]) + 0.5)
+    assert pixels[tuple(middle.astype(int))].min(1).max() < 0.9
 
 
 def test_the_picture_is_written_and_reproducible(painted, tmp_path):

@@ -51,7 +51,9 @@ class SceneInk:
     gap: int = 5
     rim: int = 3  # width of the dark rim of an object [pixels]
     rim_factor: float = 0.5  # factor on the colour of this rim
-    target_rim: int = 5  # width of the white rim of the target [pixels]
+    # side [pixels] of the square that widens the target to its white rim, which lies outside of it:
+    # else it would hide a thin target
+    target_rim: int = 7
     # greatest distance of the pixels of a support from it, in standard deviations of the noise
     noise: float = 3.0
     blur: float = 1.5  # standard deviation [pixels] that smooths the depth before its slopes
@@ -134,7 +136,7 @@ def encode_scene(scene: Scene) -> bytes:
     color[_rim(whole, INKS.rim) & (labels > 0)] *= INKS.rim_factor
     color[bare & (kinds == UNMEASURED)] = rgb(KINDS["not measured"])
     if scene.target is not None:
-        color[_rim(whole == scene.target, INKS.target_rim)] = 1.0
+        color[_rim(whole == scene.target, INKS.target_rim) & (labels != scene.target)] = 1.0
     scale = INKS.size / max(h, w)
     picture = Image.fromarray(np.uint8(FULL * color.clip(0, 1)))
     picture = picture.resize((round(w * scale), round(h * scale)), Image.Resampling.BICUBIC)
