@@ -2,15 +2,18 @@
 of the two hands.
 """
 
+import copy
+import dataclasses
 import math
 
 import pytest
 import torch
 
 from tests.make import near, real
-from torchgrasp import Hand, load_hand
+from torchgrasp import Hand, load_hand, sample_configurations
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rotation_from_rpy
+from torchgrasp.hand import hand_abilities
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.testing import largest_fk_error, random_joints
 
@@ -215,3 +218,26 @@ def test_tactile_fingertips_reach_23_mm_farther_and_change_nothing_else():
             hand.link_poses(joints)[hand.tree.link_names.index(name)] for hand in (stock, tactile)
         ]
         torch.testing.assert_close(*found, rtol=0, atol=1e-12)
+
+
+def test_a_hand_that_was_changed_in_place_is_refused_and_a_replaced_one_is_taken():
+    """A limit that was narrowed in place would reach some functions, and not what they cached."""
+    hand = load_hand("barrett")
+    middle = (hand.lower + hand.upper) / 2
+    opened = hand.lower  # no copy, although it looks like one
+    opened[0] += 0.1
+    calls = [hand.fingertips, hand.jacobian, hand.self_clearance, hand.check_joints, hand.expand]
+    for call in calls:
+        with pytest.raises(BadArgument, match="changed in place"):
+            call(middle)
+    with pytest.raises(BadArgument, match="make another"):
+        hand_abilities(hand, postures=100)
+    other = load_hand("barrett")
+    upper = other.upper.clone()
+    upper[0] = 0.5
+    narrow = dataclasses.replace(other, actuated=dataclasses.replace(other.actuated, upper=upper))
+    near(narrow.fingertips(middle)[0], other.fingertips(middle)[0], 0)
+    assert float(sample_configurations(narrow, 50).joints[:, 0].max()) <= 0.5
+    for copied in (copy.copy(narrow), copy.deepcopy(narrow), narrow.to("cpu")):
+        assert copied == narrow
+        near(copied.fingertips(middle)[0], other.fingertips(middle)[0], 0)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value, kept
+from torchgrasp.foundation.base import Value, kept, named_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import pytorch_kinematics
@@ -82,7 +82,8 @@ class Hand(Value):
     `joint_names`. Their unit is [rad], or [m] for sliding joints. Here f counts the fingertips, j
     all movable joints of the URDF, l its links, and s the collision spheres. `*b` stands for any
     batch axes. Methods raise `BadArgument` for joints of a wrong count or dtype, and for NaN or
-    infinity.
+    infinity. They also raise it for a hand whose tensors were changed in place, as by
+    `hand.upper[0] = 1`.
 
     Attributes:
         name: name of the hand.
@@ -120,6 +121,10 @@ class Hand(Value):
     collision_spheres: CollisionSpheres = dataclasses.field(repr=False)
     self_collision: SelfCollision = dataclasses.field(repr=False)
 
+    def __post_init__(self) -> None:
+        """Record the tensors as they are now (`_versions`)."""
+        _ = self._versions
+
     @property
     def urdf_path(self) -> Path:
         """The path of the hand's URDF."""
@@ -154,10 +159,36 @@ class Hand(Value):
             self.tree, self.actuated.coupling, [*points, (tips.index, tips.normal, 0.0)]
         )
 
-    @functools.cached_property
+    @property
     def derived(self) -> dict[Any, Any]:
         """A cache of values that torchgrasp computes from the hand, such as `hand_abilities`."""
+        self._check_unchanged()
+        return self._derived
+
+    @functools.cached_property
+    def _derived(self) -> dict[Any, Any]:
+        """The content of `derived`."""
         return {}
+
+    @functools.cached_property
+    def _versions(self) -> tuple[tuple[Tensor, ...], int]:
+        """The hand's tensors, and how often they had been changed in place when this was computed.
+
+        Tensors of inference mode, whose changes torch does not count, are left out.
+        """
+        tensors = tuple(x for x in named_tensors(self).values() if not x.is_inference())
+        return tensors, _changes(tensors)
+
+    def _check_unchanged(self) -> None:
+        """Raise `BadArgument` if a tensor of the hand was changed in place: cached values would
+        still be those of the old one.
+        """
+        if torch.compiler.is_compiling():
+            return
+        tensors, changes = self._versions
+        if _changes(tensors) != changes:
+            allowed = "a hand as it was made: change a copy, or make another by dataclasses.replace"
+            raise BadArgument("hand", f"{self.name}, changed in place", allowed)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -220,6 +251,7 @@ class Hand(Value):
         torchgrasp.foundation.errors.BadArgument: joints: expected a number in [0, 3.14159], got
         4.14159 for spread
         """
+        self._check_unchanged()
         self.actuated.check_limits(joints)
         return joints
 
@@ -250,6 +282,7 @@ class Hand(Value):
         the actuated joints. Raises `BadArgument` for joints of a wrong count, dtype or device, and
         for NaN or infinity.
         """
+        self._check_unchanged()
         return self.actuated.expand(joints)
 
     @checked(gradients=True)
@@ -392,6 +425,11 @@ class Hand(Value):
         """Return the positions [rad or m] of all movable joints as columns: one posture in each."""
         values = self.expand_joints(joints)
         return values.reshape(-1, values.shape[-1]).T.contiguous()
+
+
+def _changes(tensors: tuple[Tensor, ...]) -> int:
+    """Return how often tensors were changed in place, which torch counts."""
+    return sum(x._version for x in tensors)
 
 
 def _rows(columns: Tensor, joints: Float[Tensor, "*b h"]) -> Tensor:
