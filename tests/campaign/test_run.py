@@ -156,6 +156,11 @@ def test_bad_arguments_are_named_before_any_work(carton: Path, tmp_path: Path, c
             CampaignSpec(licence=licence)
     with pytest.raises(DatasetError, match=r"objects: expected .*got"):
         run_campaign(tmp_path / "none", load_hand("barrett"), tmp_path / "out")
+    # jobs read the hand's files
+    hand = load_hand("barrett")
+    narrow = dataclasses.replace(hand.actuated, upper=0.5 * hand.upper)
+    with pytest.raises(BadArgument, match=r"hand: expected .*got"):
+        run_campaign(carton, dataclasses.replace(hand, actuated=narrow), tmp_path / "out")
     words = ["campaign", str(carton), "--hand", "barrett", "--out", str(tmp_path / "out")]
     for more, named in (
         (["--hand", "fist"], "--hand"),

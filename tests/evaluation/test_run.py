@@ -91,6 +91,10 @@ def test_bad_protocols_and_specs_are_named_before_any_work():
         evaluate(Path("nowhere"), hand, "best")
     with pytest.raises(BadArgument, match=r"objects: expected .*got"):
         evaluate(Path("nowhere"), hand)
+    # workers read the hand's files
+    narrow = dataclasses.replace(hand.actuated, upper=0.5 * hand.upper)
+    with pytest.raises(BadArgument, match=r"hand: expected .*got"):
+        evaluate(Path("nowhere"), dataclasses.replace(hand, actuated=narrow))
     with pytest.raises(BadArgument, match=r"grasps: expected .*got"):
         EvaluationSpec(grasps=0)
 

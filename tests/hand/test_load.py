@@ -2,6 +2,7 @@
 URDF.
 """
 
+import dataclasses
 import re
 import shutil
 
@@ -9,7 +10,8 @@ import pytest
 import torch
 
 from torchgrasp.foundation.errors import BadArgument, HandFileError
-from torchgrasp.hand.load import find_hand, hands_folder, load_hand
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import check_as_loaded, find_hand, hands_folder, load_hand, with_fingers
 
 
 def test_a_hand_is_found_by_name_folder_and_file_and_unknown_ones_are_named(tmp_path):
@@ -134,3 +136,34 @@ def test_the_toy_hand_turns_its_fingers(toy_hand):
         points[0], torch.stack([0.01 + 0.1 * sine, 0 * sine, 0.1 * cosine]), atol=1e-7, rtol=0
     )
     torch.testing.assert_close(normals[0], torch.stack([sine, 0 * sine, cosine]), atol=1e-7, rtol=0)
+
+
+def test_a_hand_with_other_numbers_than_its_files_is_not_read_again(toy_hand):
+    """What reads the files again would return the old numbers."""
+
+    def narrowed(hand: Hand) -> Hand:
+        upper = hand.upper * torch.tensor([0.2, *[1.0] * (hand.dof - 1)]).to(hand.upper)
+        return dataclasses.replace(hand, actuated=dataclasses.replace(hand.actuated, upper=upper))
+
+    def weakened(hand: Hand) -> Hand:
+        drives = {name: x._replace(effort=x.effort / 2) for name, x in hand.actuators.items()}
+        return dataclasses.replace(hand, actuators=drives)
+
+    hand = load_hand("allegro")
+    for changed in (narrowed(hand), weakened(hand)):
+        with pytest.raises(BadArgument, match=r"hand: expected .*change its files.*allegro"):
+            check_as_loaded(changed)
+        with pytest.raises(BadArgument, match=r"hand: expected .*change its files.*allegro"):
+            with_fingers(changed, "four")
+        assert with_fingers(changed, "default") is changed
+    # each way to load and move a hand is one of the files
+    for other in (load_hand("allegro", "four"), load_hand("allegro", ("thumb", "ring", "index"))):
+        for moved in (other, other.to(torch.float32), other.to(torch.float32).to(torch.float64)):
+            check_as_loaded(moved)
+    assert with_fingers(hand.to(torch.float32), "four").lower.dtype == torch.float32
+    toy = load_hand(toy_hand)
+    check_as_loaded(toy)
+    file = toy_hand / "hand.toml"
+    file.write_text(file.read_text() + "# another file\n")
+    with pytest.raises(BadArgument, match="change its files"):
+        check_as_loaded(toy)

@@ -26,6 +26,7 @@ from torchgrasp.foundation.errors import BadArgument, DatasetError, Status
 from torchgrasp.foundation.jobs import run_as_they_end
 from torchgrasp.foundation.rules import Range
 from torchgrasp.hand.hand import Hand, HandSource
+from torchgrasp.hand.load import check_as_loaded
 
 LONGEST_LICENCE = 100  # letters of a licence's name; those of the SPDX list have at most 40
 
@@ -111,7 +112,7 @@ def run_campaign(
     Args:
         objects: folder of objects with its manifest, as `write_objects` makes it. On a cluster it
             has the same path on every machine.
-        hand: from `load_hand`, with the fingers that grasp.
+        hand: the hand as `load_hand` returns it, with the fingers that grasp.
         folder: folder of the data set. No other run may write to it at the same time.
         spec: options of the campaign; None means `CampaignSpec()`.
         workers: number of processes on this machine; 0 means this process. Or the address of a Dask
@@ -123,6 +124,7 @@ def run_campaign(
         BadArgument: an unknown protocol, or no Dask scheduler at the address `workers`.
         BadArgument: `spec.device` is "cuda", but `workers` is not the address of a Dask scheduler.
         BadArgument: a machine of the cluster has other versions or another hand.
+        BadArgument: the hand has other numbers than its files.
         OutputError: the folder holds another campaign, such as one of other meshes or clouds, or
             other files; another run uses it, or it cannot be written.
         MissingExtra: the simulator, pebble for workers, or Dask for a cluster is not installed.
@@ -142,8 +144,9 @@ def run_campaign(
     spec = CampaignSpec() if spec is None else spec
     if spec.device != "cpu" and not isinstance(workers, str):
         raise BadArgument("workers", workers, "a Dask scheduler, whose workers have the GPUs")
-    place = Path(objects).resolve()
     test = spec.test
+    check_as_loaded(hand)  # each job reads the files
+    place = Path(objects).resolve()
     rows = _list_jobs(place, spec)
     asked = _request(place, rows, hand, spec)
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, hand, test.noise.draws))

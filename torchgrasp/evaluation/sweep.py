@@ -28,6 +28,7 @@ from torchgrasp.foundation.errors import DatasetError, Status, one_line
 from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.foundation.rules import Range
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import check_as_loaded
 
 # limits of the CPU time [s] of planning on a view and of an attempt; see `run_tasks`
 PLAN_LIMIT = 900.0
@@ -54,7 +55,7 @@ def evaluate(
 
     Args:
         objects: folder of objects with its manifest, as `write_objects` makes it.
-        hand: the hand that grasps.
+        hand: the hand that grasps, as `load_hand` returns it.
         protocol: a protocol, or its name in `PROTOCOLS`.
         spec: which views and grasps are tried; None means `EvaluationSpec()`.
         folder: folder in which the executable grasps of each view, those that passed all checks,
@@ -66,7 +67,7 @@ def evaluate(
             `summarise` counts, depends on the speed of the machine.
 
     Raises:
-        BadArgument: the protocol is unknown.
+        BadArgument: the protocol is unknown, or the hand has other numbers than its files.
         DatasetError: the manifest is missing or malformed, or has none of the objects.
         OutputError: another run holds the folder, or it cannot be written.
         MissingExtra: the simulator is not installed, or pebble for workers.
@@ -86,6 +87,7 @@ def evaluate(
     [True]
     """
     protocol = find_protocol(protocol)
+    check_as_loaded(hand)  # each task reads the files
     spec = EvaluationSpec() if spec is None else spec
     views = []
     refused = []

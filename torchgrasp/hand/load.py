@@ -3,6 +3,9 @@
 import hashlib
 from pathlib import Path
 
+import torch
+
+from torchgrasp.foundation.base import named_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.foundation.limits import HAND_LINK_MASS
@@ -14,6 +17,8 @@ from torchgrasp.hand.hand_toml import Fingers, HandSpec, leading, read_hand_toml
 from torchgrasp.hand.kinematics import chain_from_urdf, tree_from_urdf
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.values.planning import Grasps
+
+ROUNDING = 1e-6  # greatest difference of a hand's numbers, absolute and relative: that of float32
 
 
 def hands_folder() -> Path:
@@ -127,13 +132,41 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
 
     Raises:
         HandFileError: a file is missing or malformed, or the two files contradict each other.
-        BadArgument: the hand has no such fingers.
+        BadArgument: the hand has no such fingers, or other numbers than its files.
 
     >>> with_fingers(load_hand("allegro"), 4).finger_names
     ('index', 'middle', 'ring', 'thumb')
     """
     other = load_hand(hand.urdf_path.parent, fingers)
-    return hand if other.finger_names == hand.finger_names else other.to(hand.lower)
+    if other.finger_names == hand.finger_names:
+        return hand
+    check_as_loaded(hand)
+    return other.to(hand.lower)
+
+
+def check_as_loaded(hand: Hand) -> None:
+    """Raise `BadArgument` for a hand with other numbers than its files, such as narrower limits.
+
+    Functions call it that read the files again, and would not use such numbers.
+    """
+    loaded = load_hand(hand.urdf_path.parent, hand.source.option)
+    ours = named_tensors(hand.to("cpu", torch.float64))
+    theirs = named_tensors(loaded)
+    same = loaded.source.sha256 == hand.source.sha256
+    same = same and loaded.actuators == hand.actuators and ours.keys() == theirs.keys()
+    if not same or not all(_agree(ours[name], theirs[name]) for name in theirs):
+        found = f"one of {hand.name} that is not as in {hand.urdf_path.parent}"
+        allowed = "a hand as load_hand returns it: it is read again here, so change its files"
+        raise BadArgument("hand", found, allowed)
+
+
+def _agree(one: torch.Tensor, other: torch.Tensor) -> bool:
+    """Return whether two tensors have one shape, and equal numbers but for the rounding of
+    float32.
+    """
+    if one.shape != other.shape:
+        return False
+    return torch.allclose(one.double(), other.double(), rtol=ROUNDING, atol=ROUNDING)
 
 
 @checked
