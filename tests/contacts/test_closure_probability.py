@@ -7,7 +7,7 @@ from tests.contacts.closure_reference import redrawn_closure
 from tests.make import HALF_BALL_RADIUS as RADIUS
 from tests.make import contacts_on, near, spokes
 from tests.make import half_ball as ball
-from torchgrasp import Contacts, ContactSpec, closure_probability
+from torchgrasp import Contacts, ContactSpec, closure_probability, hold_probability
 from torchgrasp.foundation.errors import BadArgument
 
 
@@ -44,6 +44,22 @@ def test_the_probability_is_a_share_with_a_bounded_error_and_bad_arguments_are_n
     ):
         with pytest.raises(BadArgument, match=match):
             closure_probability(doubtful, wrong, **options)
+
+
+def test_normals_that_point_inward_are_refused_and_single_poor_ones_are_not(doubtful, generator):
+    """Fingers would come from within the object, and meet no surface: the result was 0."""
+    contacts = contacts_on(doubtful, generator, 6)
+    inward = Contacts(contacts.points, -contacts.normals)
+    for rows in (slice(None), [2]):
+        with pytest.raises(BadArgument, match=r"contacts.normals: expected outward.*point into"):
+            closure_probability(doubtful, inward[rows], n=100)
+        with pytest.raises(BadArgument, match=r"contacts.normals: expected outward.*point into"):
+            hold_probability(inward[rows], 0.5, shape=doubtful, draws=10)
+    # every set has one poor normal
+    normals = contacts.normals.clone()
+    normals[:, 0] *= -1
+    found = closure_probability(doubtful, Contacts(contacts.points, normals), n=100)
+    assert float(found.probability.max()) < 0.1
 
 
 @pytest.mark.parametrize(("fingertips", "friction"), [(3, 0.6), (4, 0.3)])

@@ -34,6 +34,8 @@ from torchgrasp.values.specs import ContactSpec
 FOOTPRINT = 0.012
 # nodes of a line, in standard deviations of the surface at its contact
 NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
+# mean cosine of the contacts' normals with those of the shape, below which they all point inward
+INWARD = -0.8
 LINES = 32  # contact sets whose covariances are computed at a time: they stay in the cache
 DRAWS = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
 DRAWS_ON_GPU = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB
@@ -112,7 +114,7 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
     The contacts [m] are in the frame of the cloud, the result is in normalised units of the shape.
     Raises `BadArgument` for sets of other than 3 to 5 contacts, and normals not of length 1. It is
     also raised for a contact outside the domain, or within 12 mm (`FOOTPRINT`) of its edge. The
-    domain is the ball in which the posterior is valid.
+    domain is the ball in which the posterior is valid. It is raised for normals that point inward.
     """
     f = check_contacts(contacts).fingertips
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
@@ -133,9 +135,23 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
         distance = torch.where(own[..., None], parts[1], distance)
         slope = torch.where(own[..., None, None], parts[2], slope)
         covariance = covariance + parts[3] * _on_same(own)
+    _check_outward(normals, slope[:, :, NODES.index(0.0)])
     prior = float(shape.prior_block()[0, 0])
     root = symmetric_root(shape.std_factor**2 * covariance, prior, "contacts within the domain")
     return LinePosterior(points, normals, deviation, distance, slope, root)
+
+
+def _check_outward(normals: Vectors, slope: Vectors) -> None:
+    """Raise `BadArgument` if the normals of the contacts point into the shape, as other libraries
+    have them.
+
+    `slope` is the mean gradient of the signed distance at the contacts. Single normals may do so,
+    as those of poor contacts.
+    """
+    cosines = dot(normals, unit(slope)).detach()
+    if is_known(cosines) and len(cosines) and float(cosines.mean()) < INWARD:
+        found = "normals that point into the shape"
+        raise BadArgument("contacts.normals", found, "outward normals, so perhaps -normals")
 
 
 def _on_same(own: Bool[Tensor, "b f"]) -> Bool[Tensor, "b z z"]:
@@ -301,7 +317,7 @@ def closure_probability(
         seed: random seed.
 
     Raises `BadArgument` for a contact that is not finite, or is outside the shape's domain or at
-    its edge. It is also raised for a wrong argument.
+    its edge. It is also raised for a wrong argument, such as normals that point inward.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

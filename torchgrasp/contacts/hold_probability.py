@@ -177,7 +177,8 @@ def hold_probability(
     * normals that are not of length 1 (to 1e-3);
     * numbers outside their range;
     * contacts outside the domain of the `shape`, or within 12 mm (`FOOTPRINT`) of its edge. The
-      domain is the ball in which the posterior is valid.
+      domain is the ball in which the posterior is valid;
+    * normals that point into the `shape`.
 
     The result is differentiable twice in contacts, `tilt` and `weight.center`. All contact sets
     use the same random numbers.
