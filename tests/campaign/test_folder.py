@@ -27,6 +27,7 @@ from tests.campaign.cheap import (
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.data import read_shards
 from torchgrasp.files import hold_folder
+from torchgrasp.foundation.base import named_tensors
 from torchgrasp.foundation.errors import ModelFileError, OutputError, Status
 
 JOBS = 21
@@ -69,6 +70,23 @@ def test_every_job_has_a_row_and_the_card_tells_the_truth(whole: Path):
         and f"{JOBS} jobs" in text
         and "| bad_object | 1 |" in text
     )
+
+
+def test_changes_in_place_of_what_was_read_do_not_reach_later_reads(whole: Path):
+    """A loader that adds noise in place, or turns the frames, would add up over the epochs."""
+    data = read_shards(whole)
+    truth = read_shards(whole)
+    job = data.job(5)
+    assert job.cloud is not None
+    for x in (job.cloud.points, job.passed, job.outcome, *named_tensors(job.grasps).values()):
+        x.zero_()
+    for i in range(3):
+        for x in data[i].values():
+            x.zero_()
+        assert all(torch.equal(x, truth[i][name]) for name, x in data[i].items())
+    assert data.job(5).grasps == truth.job(5).grasps
+    assert data.job(5).cloud == truth.job(5).cloud
+    assert torch.equal(data.job(5).passed, truth.job(5).passed)
 
 
 def test_a_job_is_read_as_it_was_written(whole: Path):

@@ -71,6 +71,9 @@ def test_a_folder_serves_a_loader_posture_by_posture(tmp_path, small):
         joints[order], whole.joints[whole.joints[:, 0].argsort()]
     ) and codes.shape == (1100, 6)
     assert torch.equal(samples[-1][1], whole.q[1099])
+    for x in samples[7]:
+        x.add_(1.0)  # noise in place must not add up over the epochs
+    assert torch.equal(samples[7][0], whole.joints[7]) and torch.equal(samples[7][1], whole.q[7])
     with pytest.raises(IndexError):
         samples[1100]
     with pytest.raises(TypeError):

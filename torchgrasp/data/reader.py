@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchgrasp.data.shards import MOST, JobRow, Shard, load_shard, read_row, shard_ranges
 from torchgrasp.files import Recent, read_json
+from torchgrasp.foundation.base import map_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import ModelFileError
 from torchgrasp.foundation.rules import Count, Range
@@ -130,8 +131,12 @@ class GraspShards:
             "points": _choose(records.points, self.points, i),
             "viewpoint": records.viewpoints[0],
         }
-        single = {name: x.float().as_subclass(Tensor) for name, x in item.items()}
-        return {**single, "closed": certificate.closed[g], "job": torch.tensor(j)}
+        # copies: callers may change items in place, and the shard stays in memory
+        single = {
+            name: x.to(torch.float32, copy=True).as_subclass(Tensor) for name, x in item.items()
+        }
+        closed = certificate.closed[g].clone()
+        return {**single, "closed": closed, "job": torch.tensor(j)}
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
@@ -146,7 +151,8 @@ class GraspShards:
             ModelFileError: the job's file is missing, damaged, or of another campaign.
         """
         j = range(len(self.jobs))[j]
-        row, records = self._take(j)
+        row, kept = self._take(j)
+        records = map_tensors(torch.clone, kept)  # callers may change it in place
         grasps = dataclasses.replace(records.grasps, meta=dict(row[0].meta))
         eye = records.viewpoints[0] if bool(records.viewpoints.any()) else None
         cloud = PointCloud(records.points, viewpoint=eye) if len(records.points) else None

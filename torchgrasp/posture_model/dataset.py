@@ -91,7 +91,8 @@ class SampleFolder:
         """
         chunk, row = divmod(range(self.n)[operator.index(i)], CHUNK_POSTURES)
         samples = self.recent.get(chunk, self.chunk)
-        return samples.joints[row], samples.q[row]
+        # copies: callers may change them in place, and the chunk stays in memory
+        return samples.joints[row].clone(), samples.q[row].clone()
 
     def __iter__(self) -> Iterator[HandSamples]:
         return (self.chunk(i) for i in range(len(chunk_sizes(self.n))))
