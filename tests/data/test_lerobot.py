@@ -152,6 +152,11 @@ def test_what_is_no_episode_is_refused_and_the_same_call_changes_nothing(
             write_lerobot(tmp_path / "bad", [good, ("", bad)], hand)
     with pytest.raises(BadArgument, match=r"episodes\[0\]"):
         write_lerobot(tmp_path / "bad", [good], load_hand("barrett"))
+    # forces would have the names of other fingers
+    for fingers in (("index", "ring", "thumb"), ("thumb", "index", "middle")):
+        with pytest.raises(BadArgument, match=r"episodes\[0\].*fingers index, middle, thumb$"):
+            write_lerobot(tmp_path / "bad", [good], load_hand("allegro", fingers))
+    assert closing.finger_names == hand.finger_names
     with pytest.raises(BadArgument, match="at least one"):
         write_lerobot(tmp_path / "bad", [], hand)
     assert not (tmp_path / "bad").exists()

@@ -53,11 +53,12 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
     Args:
         folder: the folder to write.
         episodes: pairs of a task in words and the `ClosureResult` of `close_hand`.
-        hand: the hand of all closings.
+        hand: the hand of all closings, with their fingers.
 
     Raises:
         BadArgument: there is no closing, or a closing has a single tick.
-        BadArgument: a closing is of another hand, or has another control rate than the first one.
+        BadArgument: a closing is of another hand or of other fingers, or has another control rate
+            than the first one.
         OutputError: the folder holds other files, or cannot be written.
         MissingExtra: pyarrow is not installed.
 
@@ -79,9 +80,15 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
             round(1 / float(x.time[1] - x.time[0]), RATE_DECIMALS) if len(x.time) > 1 else 0.0
         )
         same = sorted(x.joint_names) == joints and x.forces.shape[1] == len(hand.finger_names)
+        # forces are named by the fingers
+        same = same and x.finger_names in ((), hand.finger_names)
         if not same or not rates[i] or rates[i] != rates[0]:
             found = f"{len(x.time)} ticks at {rates[i]:g} Hz of {len(x.joint_names)} joints"
-            allowed = f"a closing of {hand.name}, two ticks or more, all at one rate"
+            found += f", fingers {', '.join(x.finger_names)}" if x.finger_names else ""
+            allowed = (
+                f"a closing of {hand.name} with the fingers {', '.join(hand.finger_names)}, two "
+                "ticks or more, all at one rate"
+            )
             raise BadArgument(f"episodes[{i}]", found, allowed)
     if not rates:
         raise BadArgument("episodes", "none", "at least one closing")

@@ -381,4 +381,5 @@ class RecordedLift:
             seconds=seconds,
             friction=self.run.controller.friction,
             mass=self.run.controller.mass,
+            finger_names=robot.reference.hand.finger_names,
         )

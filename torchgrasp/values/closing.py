@@ -177,6 +177,8 @@ class ClosureResult(Value):
             hold in the mode "grip" (`TrialSpec.holding`).
         mass: `Distribution` of the object's mass [kg], from the load that the hand measured while
             nothing pushed at the object. None if the holding mode "grip" measured no steady load.
+        finger_names: names of the f fingers, in the order of all tensors of fingers. It is empty
+            for a record that does not name them.
     """
 
     held: bool
@@ -204,6 +206,7 @@ class ClosureResult(Value):
     seconds: float
     friction: Distribution | None = None
     mass: Distribution | None = None
+    finger_names: tuple[str, ...] = ()
 
 
 SensorKind = Literal["tactile", "torque", "binary"]
