@@ -19,11 +19,14 @@ from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.export import (
     format_graspgen,
     format_grasps,
+    format_isaac,
+    format_keyframes,
     format_moveit,
     format_trajectories,
     grasps_from_joints,
     read_foreign,
     save_dexgraspbench,
+    save_play,
 )
 from torchgrasp.foundation.errors import BadArgument, GraspFileWarning, ModelFileError, Status
 
@@ -44,6 +47,36 @@ def turned(axis, angle):
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_rotvec(angle * np.array(axis)).as_matrix()
     return matrix
+
+
+def test_grasps_that_failed_are_written_only_where_their_status_is(tmp_path):
+    """A plan has them, too, and a robot would play them."""
+    hand, one = pinch("allegro")
+    rows = [0, 0, 0]
+    statuses = [Status.OK, Status.PREGRASP, Status.TIP_ERROR]
+    plan = dataclasses.replace(one[rows], status=torch.tensor([int(x) for x in statuses]))
+    writers = {
+        "isaac": lambda x: format_isaac(hand, x),
+        "moveit": lambda x: format_moveit(hand, x),
+        "trajectories": lambda x: format_trajectories(hand, x),
+        "keyframes": lambda x: format_keyframes(hand, x),
+        "bench": lambda x: save_dexgraspbench(hand, x, tmp_path / "bench", "x"),
+        "play": lambda x: save_play(hand, x, tmp_path / "play", "mujoco", cylinder()),
+    }
+    for write in writers.values():
+        with pytest.raises(BadArgument, match=r"2 of 3 that failed \(1 \w+, 1 \w+\)"):
+            write(plan)
+    assert list(tmp_path.iterdir()) == []
+    for write in writers.values():
+        write(plan[plan.status == Status.OK])
+        write(plan.best)
+    told = json.loads(format_grasps(hand, plan))["grasps"]
+    assert [x["status"] for x in told] == [x.name for x in statuses]
+    assert json.loads(format_graspgen(plan, "x"))["grasps"]["object_in_gripper"] == [
+        True,
+        False,
+        False,
+    ]
 
 
 def menagerie_tips(qpos):

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.export.postures import (
+    check_all_executable,
     check_flange,
     check_still,
     follower_joints,
@@ -95,7 +96,7 @@ def format_isaac(
             `gripper_frame`.
 
     Raises:
-        BadArgument: joints are of another hand.
+        BadArgument: joints are of another hand, or grasps failed a check.
         BadArgument: the `force` is outside 0.01 to 100 N, or `kp` is not positive.
         BadArgument: names are unknown, empty or equal.
         BadArgument: the flange has the name of a link of the hand that is elsewhere.
@@ -110,6 +111,7 @@ def format_isaac(
     """
     hand = hand.to("cpu")
     grasps = grasps.to("cpu")
+    check_all_executable(grasps)
     check_still(hand, grasps)
     _, postures = named_postures(hand, grasps, force, kp)
     followers = follower_joints(hand) if actuated else ()

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.export.postures import named_postures, quaternion
+from torchgrasp.export.postures import check_all_executable, named_postures, quaternion
 from torchgrasp.files import format_json, write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
@@ -65,7 +65,8 @@ def save_dexgraspbench(
         kp: stiffness [N m/rad] of DexGraspBench's drives.
 
     Raises:
-        BadArgument: the hand is not the Allegro hand, or joints are of another hand.
+        BadArgument: the hand is not the Allegro hand, joints are of another hand, or grasps failed
+            a check.
         OutputError: a file cannot be written.
 
     >>> import tempfile
@@ -80,6 +81,7 @@ def save_dexgraspbench(
     if not order:
         known = f"one of {', '.join(BENCH_HANDS)}, whose frames in the bench are known"
         raise BadArgument("hand", repr(hand.name), known)
+    check_all_executable(grasps)
     _, postures = named_postures(hand, grasps, force, kp)
     paths = list[Path]()
     closed = grasps.obj_from_hand.double().cpu()

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchgrasp.cloud.agreement import check_contacts
 from torchgrasp.control.holding import PUSH
 from torchgrasp.control.protocol import POSE_TIME
-from torchgrasp.export.postures import named_postures, quaternion
+from torchgrasp.export.postures import check_all_executable, named_postures, quaternion
 from torchgrasp.files import render, write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
@@ -114,8 +114,8 @@ def save_play(
         parts: convex parts [m] of the mesh; None means that `convex_parts` computes them.
 
     Raises:
-        BadArgument: there are no grasps, joints are of another hand, or the grasps do not touch the
-            mesh. Also a plan with an edge of the table for a player other than "mujoco".
+        BadArgument: there are no grasps, grasps failed a check, joints are of another hand, or the
+            grasps do not touch the mesh. Also a plan with an edge of the table for a player other than "mujoco".
         MeshError: the mesh is open or malformed.
         OutputError: a file cannot be written.
 
@@ -130,6 +130,7 @@ def save_play(
     """
     if not len(grasps):
         raise BadArgument("grasps", "none", "at least one grasp")
+    check_all_executable(grasps)
     table = grasps.table
     if table is not None and table.edge is not None and player != "mujoco":
         raise BadArgument("player", f"{player!r}, for a table with an edge", "'mujoco'")

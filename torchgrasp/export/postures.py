@@ -14,6 +14,7 @@ from torch import Tensor
 from torchgrasp.control.finger_forces import Squeeze, squeeze
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.files import format_json
+from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import spatial
@@ -169,6 +170,19 @@ def named_postures(
     return squeezed, {name: hand.expand(joints) for name, joints in postures.items()}
 
 
+def check_all_executable(grasps: Grasps) -> None:
+    """Raise `BadArgument` for grasps that failed a check, as the result of `plan_grasps` may have.
+
+    Formats that have no place for a status call it: a robot would play these grasps, too.
+    """
+    failed = {s: k for s, k in count_status(grasps.status).items() if s is not Status.OK}
+    if failed:
+        causes = ", ".join(f"{k} {s.name}" for s, k in failed.items())
+        found = f"{sum(failed.values())} of {len(grasps)} that failed ({causes})"
+        allowed = "executable grasps, as grasps[grasps.status == Status.OK] or grasps.best"
+        raise BadArgument("grasps", found, allowed)
+
+
 def _check_executable(hand: Hand, grasps: Grasps) -> None:
     """Raise `BadArgument` for joints of executable grasps beyond their limits, or an approach that
     is no unit vector.
@@ -266,8 +280,8 @@ def format_keyframes(
         force: normal force [N] of the strongest finger at the squeeze.
         kp: stiffness [N m/rad] of every drive; None means the hand's own.
 
-    Raises `BadArgument` for joints of another hand. It is also raised for a `force` outside 0.01 to
-    100 N, or a `kp` that is not positive.
+    Raises `BadArgument` for joints of another hand, and for grasps that failed a check. It is also
+    raised for a `force` outside 0.01 to 100 N, or a `kp` that is not positive.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -275,6 +289,7 @@ def format_keyframes(
     >>> text.count("<key ")
     4
     """
+    check_all_executable(grasps)
     grasps = grasps.to("cpu")
     urdf = read_urdf(hand.urdf_path)
     _, postures = named_postures(hand, grasps, force, kp)

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.arm_motion import ArmMotion
 from torchgrasp.export.postures import (
+    check_all_executable,
     check_flange,
     check_still,
     follower_joints,
@@ -88,7 +89,7 @@ def format_moveit(
             of ros2_control refuse both.
 
     Raises:
-        BadArgument: joints are of another hand.
+        BadArgument: joints are of another hand, or grasps failed a check.
         BadArgument: the `force` is outside 0.01 to 100 N, or `kp` is not positive.
         BadArgument: names are unknown, empty or equal.
         BadArgument: a hand must go down while it closes, because its opened fingers would be in the
@@ -100,6 +101,7 @@ def format_moveit(
     >>> print(text.splitlines()[2])
     # the hand's frame is link 'palm' of hand.urdf; joints in the order of joint_names
     """
+    check_all_executable(grasps)
     hand = hand.to("cpu")
     grasps = grasps.to("cpu")
     up = UP if grasps.table is None else grasps.table.normal
@@ -156,8 +158,9 @@ def format_trajectories(
         actuated: whether to leave out coupled joints, which follow others. Controllers of
             ros2_control refuse their names.
 
-    Raises `BadArgument` for joints of another hand, and for names that are unknown, empty or equal.
-    It is also raised for a `force` outside 0.01 to 100 N, or a `kp` that is not positive.
+    Raises `BadArgument` for joints of another hand, and for grasps that failed a check. It is
+    raised for names that are unknown, empty or equal. It is also raised for a `force` outside 0.01
+    to 100 N, or a `kp` that is not positive.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -165,6 +168,7 @@ def format_trajectories(
     >>> text.count("time_from_start")
     3
     """
+    check_all_executable(grasps)
     what = "a trajectory_msgs/JointTrajectory for each grasp"
     # A point at time 0 would be a jump from wherever the hand is.
     times = POSE_TIME, 2 * POSE_TIME, 3 * POSE_TIME
