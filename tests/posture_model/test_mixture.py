@@ -62,6 +62,31 @@ def test_eq19_log_prob_is_the_density_and_eq21_energy_half_the_least_mahalanobis
 
 
 @pytest.mark.promise("N12")
+@pytest.mark.parametrize("name", ["weights", "means", "covariances"])
+def test_a_parameter_that_was_changed_in_place_counts_as_it_is_now(generator, name):
+    """As by an average of an optimiser's steps, whose parameters require no gradient."""
+    mixture = random_mixture(3)
+    x = torch.randn(20, 8, generator=generator, dtype=torch.float64)
+    q = x[:, 2:]
+    mixture.log_prob(x)
+    mixture.joints(q)
+    parameter = getattr(mixture, name)
+    for _ in range(2):
+        parameter.copy_(parameter.flip(0))
+        parameter *= {"weights": 1.0, "means": 1.3, "covariances": 0.7}[name]
+        parts = torch.stack([g.log_prob(x) for g in gaussians(mixture)], -1)
+        density = torch.logsumexp(parts + mixture.weights.log(), -1)
+        torch.testing.assert_close(mixture.log_prob(x), density, rtol=1e-9, atol=1e-9)
+        now = random_mixture(3)
+        getattr(now, name).copy_(parameter)
+        for found, wanted in (
+            (mixture.energy(q), now.energy(q)),
+            (mixture.joints(q), now.joints(q)),
+            (mixture.modes(q, 2)[0], now.modes(q, 2)[0]),
+        ):
+            torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+
+
 def test_eq21_thresholds_accept_what_their_names_say():
     assert math.isclose(2 * DEFAULT_ENERGY, chi2.ppf(0.95, 6), abs_tol=1e-7)
     n = 1_000_000

@@ -402,6 +402,14 @@ def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
     return tensors
 
 
+def changes_in_place(*tensors: Tensor) -> int:
+    """Return how often tensors were changed in place, so that a cached value can be told old.
+
+    Changes of inference mode, which torch does not count, are left out.
+    """
+    return sum(0 if x.is_inference() else x._version for x in tensors)
+
+
 def settle(value: SomeValue, device: torch.device) -> SomeValue:
     """Return a value on a device. A value that is already on it is returned itself, with its cached
     properties.

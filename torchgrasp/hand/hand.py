@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value, kept, named_tensors
+from torchgrasp.foundation.base import Value, changes_in_place, kept, named_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import pytorch_kinematics
@@ -172,12 +172,9 @@ class Hand(Value):
 
     @functools.cached_property
     def _versions(self) -> tuple[tuple[Tensor, ...], int]:
-        """The hand's tensors, and how often they had been changed in place when this was computed.
-
-        Tensors of inference mode, whose changes torch does not count, are left out.
-        """
-        tensors = tuple(x for x in named_tensors(self).values() if not x.is_inference())
-        return tensors, _changes(tensors)
+        """The hand's tensors, and how often they had been changed in place when this was computed."""
+        tensors = tuple(named_tensors(self).values())
+        return tensors, changes_in_place(*tensors)
 
     def _check_unchanged(self) -> None:
         """Raise `BadArgument` if a tensor of the hand was changed in place: cached values would
@@ -186,7 +183,7 @@ class Hand(Value):
         if torch.compiler.is_compiling():
             return
         tensors, changes = self._versions
-        if _changes(tensors) != changes:
+        if changes_in_place(*tensors) != changes:
             allowed = "a hand as it was made: change a copy, or make another by dataclasses.replace"
             raise BadArgument("hand", f"{self.name}, changed in place", allowed)
 
@@ -425,11 +422,6 @@ class Hand(Value):
         """Return the positions [rad or m] of all movable joints as columns: one posture in each."""
         values = self.expand_joints(joints)
         return values.reshape(-1, values.shape[-1]).T.contiguous()
-
-
-def _changes(tensors: tuple[Tensor, ...]) -> int:
-    """Return how often tensors were changed in place, which torch counts."""
-    return sum(x._version for x in tensors)
 
 
 def _rows(columns: Tensor, joints: Float[Tensor, "*b h"]) -> Tensor:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.foundation.base import Kept, Value, kept
+from torchgrasp.foundation.base import Kept, Value, changes_in_place, kept
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, Seed, check_dense, is_known
@@ -28,15 +28,22 @@ ROUNDING = 1e-6  # greatest error of the weights' sum, and relative asymmetry of
 class of_parameters(kept[Kept]):
     """A property of a mixture whose value is cached unless a parameter requires a gradient.
 
-    An optimiser may change such a parameter, so the value is then computed each time.
+    An optimiser may change such a parameter, so the value is then computed each time. It is also
+    computed anew after a parameter was changed in place, as by an average of an optimiser's steps.
     """
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
         """Return the value of the property, or the property itself if it is read of the class."""
         if instance is None:
             return self
-        if any(getattr(instance, name).requires_grad for name in PARAMETERS):
+        parameters = [getattr(instance, name) for name in PARAMETERS]
+        if any(x.requires_grad for x in parameters):
             return self.func(instance)
+        if not torch.compiler.is_compiling():
+            changes = changes_in_place(*parameters)
+            if vars(instance).setdefault(f"{self.attrname} after", changes) != changes:
+                vars(instance).pop(self.attrname, None)
+                vars(instance)[f"{self.attrname} after"] = changes
         found = vars(instance).get(self.attrname)
         return super().__get__(instance, owner) if found is None else found
 
