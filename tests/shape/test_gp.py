@@ -2,6 +2,7 @@
 kernel's domain.
 """
 
+import dataclasses
 import math
 from functools import partial
 
@@ -229,3 +230,22 @@ def test_three_points_make_the_papers_psi_indefinite_and_the_default_not():
 def test_a_normalised_frame_has_a_positive_scale(scale):
     with pytest.raises(BadArgument, match=r"^scale: expected a positive number"):
         Normalisation(torch.zeros(3), scale)
+
+
+def test_observed_normals_have_length_1_and_others_may_be_any_numbers(shape: ShapeGP):
+    """Normals of a mesh's faces that are not normalised would stretch all distances."""
+    known = half_sphere()
+    frame = Normalisation(real([0.3, -0.2, 0.1]), 0.05)
+    cloud = PointCloud(frame.metres(known.x[known.has_normal]))
+    for factor in (0.0, 0.4, 5.0):
+        longer = dataclasses.replace(known, normal=factor * known.normal)
+        with pytest.raises(BadArgument, match=r"observations.normal: expected unit vectors"):
+            condition(longer, frame, cloud)
+        with pytest.raises(BadArgument, match=r"observations.normal: expected unit vectors"):
+            shape.append(longer[known.has_normal][:2])
+    # rounded to two decimals, and without meaning where none was observed
+    normal = torch.where(known.has_normal[:, None], known.normal.mul(1e2).round() / 1e2, 7.0)
+    rounded = condition(dataclasses.replace(known, normal=normal), frame, cloud)
+    points = queries(rounded, 20)
+    exact = condition(known, frame, cloud)
+    near(rounded.predict(points).distance, exact.predict(points).distance, 2e-2)

@@ -12,12 +12,15 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Batch, Value
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.rules import Positive
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Positive, is_known
 from torchgrasp.geometry.linalg import Points, norm, unit
 from torchgrasp.shape.kernel import Queries
 
 MeanAndGradient = tuple[Float[Tensor, "q"], Queries]
 """The mean signed distance (q,) at each query point, normalised, and its gradient (q, 3)."""
+LENGTHS = (0.5, 2.0)
+"""Least and greatest length of an observed unit normal that is taken."""
 Moments = tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]
 """Mean (q, 4) and covariance (q, 4, 4) of distance and gradient (d, w) at each query point,
 normalised.
@@ -120,6 +123,20 @@ class Observations(Batch):
         """
         every = torch.cat([self.distance_noise, self.normal_noise[self.has_normal]])
         return float(every.detach().min())
+
+    def check_normals(self) -> None:
+        """Raise `BadArgument` if an observed normal is not a unit vector, as one of a mesh's face
+        whose length is the face's area. All distances would be stretched.
+
+        Lengths from 0.5 to 2 (`LENGTHS`) are taken, as an optimiser changes them a little.
+        """
+        if not (is_known(self.normal) and is_known(self.has_normal)):
+            return
+        length = norm(self.normal.detach()[self.has_normal])
+        wrong = length[(length < LENGTHS[0]) | (length > LENGTHS[1])]
+        if len(wrong):
+            found = f"a vector of length {float(wrong[0]):.4g}"
+            raise BadArgument("observations.normal", found, "unit vectors")
 
     def with_normals_first(self) -> "Observations":
         """Return the same observations in another order: those with normals come first.

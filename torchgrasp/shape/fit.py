@@ -333,6 +333,7 @@ def condition(
 
     Raises:
         BadArgument: an unknown kernel; torch.vmap that maps over points or `has_normal`.
+        BadArgument: an observed normal that is no unit vector.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise. Inside
             torch.vmap it is not raised, and the estimate is NaN.
 
@@ -347,6 +348,7 @@ def condition(
         if not is_known(getattr(observations, name)):
             allowed = "the same for all that vmap maps over"
             raise BadArgument(f"observations.{name}", "a tensor inside torch.vmap", allowed)
+    observations.check_normals()
     observations = observations.to(normalisation.center.device, torch.float64)
     psi = psi_scale * longest_distance(observations.x)
     posterior = posterior_given(observations, kernel_of(kernel, psi))
