@@ -72,6 +72,20 @@ def test_every_job_has_a_row_and_the_card_tells_the_truth(whole: Path):
     )
 
 
+def test_items_do_not_depend_on_the_default_device(whole: Path):
+    for points in (None, 3, 40):
+        data = read_shards(whole, points)
+        truth = [data[i] for i in range(3)]
+        with torch.device("meta"):  # stands for a GPU
+            found = [data[i] for i in range(3)]
+            rows = list(data.job(5).grasps)
+            assert len(data.job(3).grasps[[0, 2]]) == 2
+        assert len(rows) == 1
+        for one, other in zip(truth, found, strict=True):
+            assert one.keys() == other.keys()
+            assert all(torch.equal(one[name], other[name]) for name in one)
+
+
 def test_changes_in_place_of_what_was_read_do_not_reach_later_reads(whole: Path):
     """A loader that adds noise in place, or turns the frames, would add up over the epochs."""
     data = read_shards(whole)

@@ -136,7 +136,7 @@ class GraspShards:
             name: x.to(torch.float32, copy=True).as_subclass(Tensor) for name, x in item.items()
         }
         closed = certificate.closed[g].clone()
-        return {**single, "closed": closed, "job": torch.tensor(j)}
+        return {**single, "closed": closed, "job": torch.tensor(j, device="cpu")}
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
@@ -224,7 +224,8 @@ def _choose(points: Tensor, count: int | None, seed: int) -> Tensor:
     """Draw `count` points of a cloud; None means all points."""
     if count is None:
         return points
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator("cpu").manual_seed(seed)
+    # on the CPU, whatever torch's default device is
     if count <= len(points):
-        return points[torch.randperm(len(points), generator=generator)[:count]]
-    return points[torch.randint(len(points), (count,), generator=generator)]
+        return points[torch.randperm(len(points), generator=generator, device="cpu")[:count]]
+    return points[torch.randint(len(points), (count,), generator=generator, device="cpu")]

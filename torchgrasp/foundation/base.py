@@ -251,7 +251,8 @@ def read_rows(rows: Any, count: int) -> slice | Tensor:
     if isinstance(rows, slice):
         return rows
     try:
-        index = rows if isinstance(rows, Tensor) else torch.as_tensor(rows)
+        # on the CPU, whatever torch's default device is: it serves tensors of any device
+        index = rows if isinstance(rows, Tensor) else torch.as_tensor(rows, device="cpu")
     except (TypeError, ValueError, RuntimeError) as error:
         raise refused from error
     if index.layout is not torch.strided or index.is_meta or index.ndim > 1:
