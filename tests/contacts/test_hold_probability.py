@@ -331,6 +331,11 @@ def test_wrong_arguments_are_refused():
         ("placement", (contacts, 0.5, -0.001)),
         ("shift", (contacts, 0.5, 0.0, 0.0, -0.001)),
         ("turn", (contacts, 0.5, 0.0, 0.0, 0.0, 4.0)),
+        # two millimetres, and one degree
+        ("placement", (contacts, 0.5, 2.0)),
+        ("shift", (contacts, 0.5, 0.0, 0.0, 2.0)),
+        ("tilt", (contacts, 0.5, 0.0, 1.0)),
+        ("turn", (contacts, 0.5, 0.0, 0.0, 0.0, 1.0)),
         ("tilt", (contacts, 0.5, 0.0, -0.1)),
         ("tilt", (contacts, 0.5, 0.0, torch.full((4, 3), 4.0))),
         ("tilt", (contacts, 0.5, 0.0, torch.zeros(4, 2))),
@@ -347,6 +352,7 @@ def test_wrong_arguments_are_refused():
         ("mass", (Distribution.between(0.0, 0.1), torch.zeros(3), 5.0)),
         ("press", (0.1, torch.zeros(3), 0.0)),
         ("up", (0.1, torch.zeros(3), 5.0, torch.ones(3))),
+        ("center_std", (0.1, torch.zeros(3), 5.0, None, 2.0)),  # two millimetres
     ):
         with pytest.raises(BadArgument, match=argument):
             CarriedWeight(*arguments)

@@ -16,6 +16,7 @@ from torchgrasp.app.cli.evaluate import Evaluate
 from torchgrasp.evaluation.protocols import (
     PROTOCOLS,
     PoseNoise,
+    PullSpec,
     apply_error,
     draw_error,
     draw_hand_errors,
@@ -34,6 +35,20 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.specs import TrialSpec
+
+
+def test_motions_in_degrees_and_millimetres_are_refused():
+    """With 15 for 15 degrees, no rotation would fail a pull: an object turns by at most pi."""
+    for angle in (0.0, math.radians(15), math.pi, math.inf):
+        assert PullSpec(10.0, 2.0, 0.05, angle).angle == angle
+    for angle in (15.0, 3.2, 180.0):
+        with pytest.raises(BadArgument, match=r"angle: expected radians in \[0, pi\]"):
+            PullSpec(10.0, 2.0, 0.05, angle)
+    for distance in (5.0, 50.0):  # in centimetres, in millimetres
+        with pytest.raises(BadArgument, match=r"distance: expected a number in \[0, 0\.5\]"):
+            PullSpec(10.0, 2.0, distance, math.inf)
+        with pytest.raises(BadArgument, match=r"translation: expected a number in \[0, 0\.5\]"):
+            PoseNoise(distance)
 
 
 def test_errors_of_the_pose_stay_within_the_protocol_s():
@@ -149,6 +164,8 @@ def test_the_command_line_changes_only_what_was_asked_for_and_displaces_no_objec
     assert (moved.noise, moved.displaced, moved.push) == (PoseNoise(0.03, 0.0, 5), "approach", 2.5)
     with pytest.raises(BadArgument, match="--displaced"):
         disturbed("dexgraspbench", displaced=0.03)
+    with pytest.raises(BadArgument, match=r"^--displaced: expected a number in \[0, 0\.5\], got 3"):
+        disturbed("table-lift", displaced=3.0)
 
 
 def test_each_trial_draws_friction_and_mass_from_their_distributions():

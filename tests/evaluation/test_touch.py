@@ -15,7 +15,7 @@ from torchgrasp.app import cli
 from torchgrasp.evaluation import Touch, measure_touch
 from torchgrasp.evaluation.summary import ProtocolResult, ViewScore, summarise
 from torchgrasp.export import format_grasps
-from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.errors import BadArgument, Status
 
 LIMIT = 0.003
 
@@ -108,6 +108,8 @@ def test_verdicts_name_the_worst_finger_and_nothing_is_known_of_no_grasp():
     assert touch.deepest[:5].tolist() == pytest.approx([0.001, -0.01, -0.004, 0.001, 0.004])
     assert touch.largest[5].isnan() and touch.deepest[5].isnan()
     assert Touch(gaps[:0].double()).verdicts == []
+    with pytest.raises(BadArgument, match=r"limit: expected a number in \[0, 0\.1\], got 3"):
+        Touch(gaps.double(), 3.0)  # in millimetres, every finger would touch
 
 
 @pytest.mark.parametrize("moved", [0.0, 0.008])

@@ -44,7 +44,7 @@ from torchgrasp.contacts.form_closure import Vectors, centre_and_radius, with_to
 from torchgrasp.foundation.base import Value, at_once, in_chunks, row_numbers
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import LEAST, Force, Length, Range, Seed, is_known
+from torchgrasp.foundation.rules import LEAST, Force, Range, Seed, SmallLength, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.linalg import UNIT_TOLERANCE, dot, eye_like, norm, perpendicular, unit
@@ -53,8 +53,10 @@ from torchgrasp.values.distribution import Distribution, check_within
 from torchgrasp.values.planning import Contacts
 from torchgrasp.values.specs import FRICTIONS, GRAVITY, MASSES
 
-TILTS = Range(0.0, math.pi)
-"""The standard deviations [rad] of a normal that are possible."""
+TILTS = Range(0.0, math.pi / 4)
+"""The standard deviations [rad] of a normal, or of the object, that are taken. A greater one leaves
+no side of the object certain, and is one in degrees.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +106,7 @@ class CarriedWeight(Value):
             b contact sets.
         press: mean of the normal forces [N] with which the fingers press at the contacts.
         up: unit vector against gravity in the frame of the contacts; None means z.
-        center_std: standard deviation [m] of the centre of mass along each of three axes.
+        center_std: standard deviation [m] of the centre of mass along each of three axes, 0 to 0.1.
 
     Raises `BadArgument` for a number outside its range, or an `up` that is not of length 1.
 
@@ -115,7 +117,7 @@ class CarriedWeight(Value):
     center: Float[Tensor, "3"] | Float[Tensor, "b 3"]
     press: Force
     up: Float[Tensor, "3"] | None = None
-    center_std: Length = 0.0
+    center_std: SmallLength = 0.0
 
     def __post_init__(self) -> None:
         check_within("mass", self.mass, MASSES)
@@ -130,9 +132,9 @@ class CarriedWeight(Value):
 def hold_probability(
     contacts: Contacts,
     friction: Annotated[float, FRICTIONS] | Distribution,
-    placement: Length = 0.0,
+    placement: SmallLength = 0.0,
     tilt: Annotated[float, TILTS] | Float[Tensor, "b f"] = 0.0,
-    shift: Length = 0.0,
+    shift: SmallLength = 0.0,
     turn: Annotated[float, TILTS] = 0.0,
     weight: CarriedWeight | None = None,
     shape: ShapeGP | None = None,
@@ -156,13 +158,14 @@ def hold_probability(
         contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals.
         friction: coefficient of friction of all contacts, or its `Distribution`, in [0, 10].
         placement: standard deviation [m] of each fingertip's position along each of two
-            perpendicular tangents. The normal stays as it is, as on a surface that is flat nearby.
+            perpendicular tangents, 0 to 0.1. The normal stays as it is, as on a surface that is
+            flat nearby.
         tilt: standard deviation [rad] of the angle of a normal about each of two perpendicular
-            tangents. It is one number for all contacts, or one for each (b, f).
-        shift: standard deviation [m] of the object's position along each of three axes. Such an
-            error moves all contacts together along the surface.
+            tangents, 0 to pi / 4. It is one number for all contacts, or one for each (b, f).
+        shift: standard deviation [m] of the object's position along each of three axes, 0 to 0.1.
+            Such an error moves all contacts together along the surface.
         turn: standard deviation [rad] of the object's rotation about each of three axes through the
-            contacts' centroid.
+            contacts' centroid, 0 to pi / 4.
         weight: the weight that the contacts carry. None means that they must resist any load, with
             normal forces as large as needed.
         shape: the uncertain shape in the frame of the contacts. Random surfaces are drawn from it

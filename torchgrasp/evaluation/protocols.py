@@ -17,7 +17,7 @@ from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.foundation.rules import Count, Length, Pose, Range, Seed
+from torchgrasp.foundation.rules import Count, Displacement, Pose, Range, Seed
 from torchgrasp.geometry.frames import inverse, real, rigid, rotation_from_vector, turned_about
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.success.task import GraspTask
@@ -38,7 +38,7 @@ class PoseNoise(Value):
     turned about the vertical.
 
     Args:
-        translation: greatest error [m] along each axis, 0 to 10.
+        translation: greatest error [m] along each axis, 0 to 0.5.
         rotation: greatest error [rad] about each axis, 0 to pi; in lifts about the vertical only.
         draws: number of trials that `evaluate` runs for each grasp, each with its own error, at
             least 1.
@@ -46,7 +46,7 @@ class PoseNoise(Value):
     Raises `BadArgument` for a number outside its range.
     """
 
-    translation: Length = 0.0
+    translation: Displacement = 0.0
     rotation: Annotated[float, Range(0.0, math.pi)] = 0.0
     draws: Count = 1
 
@@ -59,17 +59,23 @@ class PullSpec(Value):
     Args:
         acceleration: force of each pull, divided by the object's mass [m/s^2], 0 to 1000.
         seconds: duration [s] of each pull, 0 to 60.
-        distance: motion [m] of the object's centre of mass at which a pull fails, 0 to 10. It
+        distance: motion [m] of the object's centre of mass at which a pull fails, 0 to 0.5. It
             counts from the start of the trial, so it includes the closing.
-        angle: rotation [rad] of the object, counted likewise, at which a pull fails; at least 0.
+        angle: rotation [rad] of the object, counted likewise, at which a pull fails: 0 to pi, or
+            infinity for any rotation.
 
     Raises `BadArgument` for a number outside its range.
     """
 
     acceleration: Annotated[float, Range(0.0, 1000.0)]
     seconds: Annotated[float, Range(0.0, 60.0)]
-    distance: Length
+    distance: Displacement
     angle: Annotated[float, Range(0.0, math.inf)]
+
+    def __post_init__(self) -> None:
+        """Raise `BadArgument` for an angle that no rotation reaches, as one in degrees."""
+        if math.pi < self.angle < math.inf:
+            raise BadArgument("angle", self.angle, "radians in [0, pi], or infinity for no bound")
 
 
 @checked

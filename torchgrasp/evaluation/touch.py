@@ -12,7 +12,7 @@ from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.lazy import spatial, trimesh
-from torchgrasp.foundation.rules import ANY, Length
+from torchgrasp.foundation.rules import ANY, SmallLength
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import Points, dot, norm
 from torchgrasp.geometry.mesh_distance import surface_distance
@@ -55,11 +55,12 @@ class Touch(Value):
         gaps: signed distances (g, f) [m] of the fingertips from the surface, at the planned
             postures. They are negative where a fingertip penetrates the object, and NaN where a
             cloud does not show the surface.
-        limit: largest size [m] of a gap of either sign at which a fingertip counts as touching.
+        limit: largest size [m] of a gap of either sign at which a fingertip counts as touching, 0
+            to 0.1.
     """
 
     gaps: Annotated[Float[Tensor, "g f"], ANY]
-    limit: Length = TOUCH.limit
+    limit: SmallLength = TOUCH.limit
 
     @property
     def largest(self) -> Float[Tensor, "g"]:
@@ -111,7 +112,7 @@ def measure_touch(
     hand: Hand,
     grasps: Grasps,
     surface: "trimesh.Trimesh | PointCloud",
-    limit: Length = TOUCH.limit,
+    limit: SmallLength = TOUCH.limit,
 ) -> Touch:
     """Return the gaps between fingertips and an object at the planned posture of each grasp.
 
@@ -125,7 +126,8 @@ def measure_touch(
         grasps: g grasps; only `joints` and `obj_from_hand` are used.
         surface: the object's mesh [m] with faces turned outward, or its cloud [m]. Both are in the
             frame of the grasps, that of the planned cloud.
-        limit: largest size [m] of a gap of either sign at which a fingertip counts as touching.
+        limit: largest size [m] of a gap of either sign at which a fingertip counts as touching, 0
+            to 0.1.
 
     Raises `BadArgument` for joints of another hand or beyond their limits, and for a cloud whose
     normals cannot be estimated.

@@ -35,7 +35,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import GraspFileWarning, ModelFileError, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import CLOUD_BYTES
-from torchgrasp.foundation.rules import Length, Pose, Poses, Positive
+from torchgrasp.foundation.rules import Pose, Poses, Positive, SmallLength
 from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.plane import Plane, read_plane
@@ -536,7 +536,7 @@ def grasps_from_joints(
     pregrasp: Float[Tensor, "g h"] | None = None,
     table: Plane | None = None,
     spec: ContactSpec | None = None,
-    std_m: Length | None = None,
+    std_m: SmallLength | None = None,
 ) -> Grasps:
     """Return imported joints and poses as `Grasps`, for `certify`, `close_hand` and the exporters.
 
@@ -558,7 +558,8 @@ def grasps_from_joints(
         table: the table under the object, in the object's frame; the opened hand stays above it.
             None means that there is no table, or that it is unknown.
         spec: friction and number of cone edges of the certificate; None means `ContactSpec()`.
-        std_m: standard deviation [m] of the surface at each contact, for closing modes that use it.
+        std_m: standard deviation [m] of the surface at each contact, 0 to 0.1, for closing modes
+            that use it.
             None means unknown.
 
     Raises `BadArgument` for wrong shapes, joints outside their limits, or poses that are not rigid.

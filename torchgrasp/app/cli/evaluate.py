@@ -175,7 +175,8 @@ class Evaluate(_Trials, ForPrograms):
                 raise BadArgument(
                     "--displaced", self.displaced, f"a protocol that lifts, not {test.name}"
                 )
-            noise = dataclasses.replace(noise, translation=self.displaced, rotation=0.0)
+            with naming(translation="--displaced"):
+                noise = dataclasses.replace(noise, translation=self.displaced, rotation=0.0)
         push = test.push if self.push is None else self.push
         relook = self.relook or test.relook
         when = "approach" if self.during else test.displaced
