@@ -15,7 +15,7 @@ from torchgrasp.app import cli
 from torchgrasp.evaluation import Touch, measure_touch
 from torchgrasp.evaluation.summary import ProtocolResult, ViewScore, summarise
 from torchgrasp.export import format_grasps
-from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument, MeshError, Status, SuspiciousScale
 
 LIMIT = 0.003
 
@@ -53,6 +53,27 @@ def test_gaps_are_those_of_a_box_and_of_a_sphere(name):
         assert np.abs(measure_touch(hand, grasp, box).gaps[0].numpy() - wanted).max() < 1e-6
         wanted = np.linalg.norm(centres - middle, axis=1) - 0.03 - radii
         assert np.abs(measure_touch(hand, grasp, ball).gaps[0].numpy() - wanted).max() < 5e-5
+
+
+def test_a_mesh_inside_out_or_in_millimetres_is_refused_and_an_open_one_is_not():
+    hand, grasp = pinch("barrett")
+    body = cylinder()
+    truth = measure_touch(hand, grasp, body)
+    # trimesh turns faces by a view of them, too
+    for faces in (body.faces[:, ::-1], body.faces[:, ::-1].copy()):
+        inside_out = trimesh.Trimesh(body.vertices, faces, process=False)
+        with pytest.raises(MeshError, match=r"surface: expected .*faces turned outward"):
+            measure_touch(hand, grasp, inside_out)
+        turned = trimesh.Trimesh(body.vertices, inside_out.faces[:, ::-1], process=False)
+        assert torch.equal(measure_touch(hand, grasp, turned).gaps, truth.gaps)
+    large = body.copy().apply_scale(1000.0)
+    with pytest.raises(SuspiciousScale, match="use metres"):
+        measure_touch(hand, grasp, large)
+    low = body.triangles_center[:, 2] < body.triangles_center[:, 2].min() + 1e-6
+    without_base = trimesh.Trimesh(body.vertices, body.faces[~low], process=False)
+    assert not without_base.is_watertight
+    near = measure_touch(hand, grasp, without_base).gaps
+    torch.testing.assert_close(near, truth.gaps, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(

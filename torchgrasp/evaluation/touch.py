@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Annotated, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,7 +12,9 @@ from torchgrasp.cloud.neighbours import usual_spacing
 from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import MeshError, SuspiciousScale
 from torchgrasp.foundation.lazy import spatial, trimesh
+from torchgrasp.foundation.limits import MAX_EXTENT
 from torchgrasp.foundation.rules import ANY, SmallLength
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import Points, dot, norm
@@ -130,7 +133,8 @@ def measure_touch(
             to 0.1.
 
     Raises `BadArgument` for joints of another hand or beyond their limits, and for a cloud whose
-    normals cannot be estimated.
+    normals cannot be estimated. Raises `MeshError` for a closed mesh with faces turned inward, and
+    `SuspiciousScale` for a mesh over 2 m.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -145,10 +149,25 @@ def measure_touch(
     if isinstance(surface, PointCloud):
         heights = _heights(points, surface, limit)
     else:
+        _check_sides(surface)
         vertices = torch.tensor(surface.vertices, dtype=torch.float64)
-        distance = surface_distance(vertices, torch.tensor(surface.faces))
+        faces = torch.tensor(np.ascontiguousarray(surface.faces))
+        distance = surface_distance(vertices, faces)
         heights = torch.from_numpy(distance(points.numpy()))
     return Touch(heights.reshape(centres.shape[:-1]) - hand.tip_radius, limit)
+
+
+def _check_sides(mesh: "trimesh.Trimesh") -> None:
+    """Raise an error for a mesh in millimetres, or a closed one that is turned inside out: every
+    fingertip would penetrate it. An open mesh is taken.
+    """
+    longest = float(mesh.extents.max()) if len(mesh.faces) else 0.0
+    if longest > MAX_EXTENT:
+        allowed = f"at most {MAX_EXTENT:g} m: use metres"
+        raise SuspiciousScale("surface", f"a mesh of {longest:.4g} m", allowed)
+    if mesh.is_watertight and mesh.volume < 0:
+        found = f"a mesh of volume {mesh.volume:.3g} m^3"
+        raise MeshError("surface", found, "a positive volume, faces turned outward")
 
 
 def _heights(points: Points, cloud: PointCloud, limit: float) -> Float[Tensor, "n"]:
