@@ -118,6 +118,17 @@ def test_grazing_surfaces_fade_out():
     assert shares[1] < 0.75 * shares[0]
 
 
+def test_a_camera_within_the_mesh_is_refused(box):
+    """The pose is in metres, and the mesh in millimetres: the view would be that of its inside."""
+    pose = look_at(60.0, 35.0, target=box)
+    large = box.copy().apply_scale(1000.0)
+    with pytest.raises(
+        BadArgument, match=r"camera_pose: expected a camera outside .*metres.*within"
+    ):
+        partial_view(large, pose)
+    assert len(partial_view(box, look_at(45.0, 35.0, 0.3, box)))  # one that is near
+
+
 def test_fewer_pixels_than_points_give_all_pixels(box):
     far = partial_view(box, look_at(0.0, 0.0, 8.0), noise=False)
     _, u, v = pixels(far, look_at(0.0, 0.0, 8.0))

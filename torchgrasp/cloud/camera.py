@@ -14,7 +14,7 @@ from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.pose import Transform, check_rigid
 from torchgrasp.cloud.sensor import Image, SensorName, SensorNoise, add_noise, find_sensor
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import MeshError
+from torchgrasp.foundation.errors import BadArgument, MeshError
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
@@ -122,6 +122,7 @@ def partial_view(
 
     Raises:
         BadArgument: `n` is below 4, the camera's name is unknown, or the pose is not rigid.
+        BadArgument: the camera is within the mesh's bounding box, as in a mesh in millimetres.
         MeshError: a mesh without faces.
         TooFewPoints: the camera sees fewer than 4 points of the mesh.
         SuspiciousScale: the points extend over less than 5 mm or more than 2 m.
@@ -133,6 +134,11 @@ def partial_view(
     """
     pose = check_rigid("camera_pose", camera_pose).double()
     depth, cosine = cast_mesh(mesh, pose)
+    low, high = torch.from_numpy(np.array(mesh.bounds))
+    eye = pose[:3, 3].cpu()
+    if bool(((low < eye) & (eye < high)).all()):
+        found = f"a camera within the mesh's box, which is {float((high - low).max()):.4g} m long"
+        raise BadArgument("camera_pose", found, "a camera outside the object, both in metres")
     generator = torch.Generator().manual_seed(seed)
     sensor = find_sensor(noise)
     if sensor is not None:
