@@ -331,6 +331,7 @@ def test_wrong_arguments_are_refused():
         ("placement", (contacts, 0.5, -0.001)),
         ("shift", (contacts, 0.5, 0.0, 0.0, -0.001)),
         ("turn", (contacts, 0.5, 0.0, 0.0, 0.0, 4.0)),
+        ("contacts.points: .*metres", (Contacts(1000 * points, normals), 0.5, 0.002)),
         # two millimetres, and one degree
         ("placement", (contacts, 0.5, 2.0)),
         ("shift", (contacts, 0.5, 0.0, 0.0, 2.0)),

@@ -84,7 +84,8 @@ class HoldProbabilityNumbers:
     """Number of pairs of a contact set and a part of the distribution that are computed at a time.
     """
     farthest: float = 2.0
-    """Greatest distance [m] of a centre of mass from the contacts: no hand carries larger things.
+    """Greatest distance [m] of a centre of mass from the contacts, and of a contact from the middle
+    of its set: no hand carries larger things.
     """
     masses: int = 9
     """Number of ranges of an uncertain mass, in each of which the critical friction is linear."""
@@ -179,6 +180,7 @@ def hold_probability(
     * sets of other than 3 to 5 contacts;
     * normals that are not of length 1 (to 1e-3);
     * numbers outside their range;
+    * contacts that are metres apart, as in millimetres;
     * contacts outside the domain of the `shape`, or within 12 mm (`FOOTPRINT`) of its edge. The
       domain is the ball in which the posterior is valid;
     * normals that point into the `shape`.
@@ -195,6 +197,7 @@ def hold_probability(
     points = check_contacts(contacts).points.double()
     normals = check_unit(contacts.normals.double())
     check_within("friction", friction, FRICTIONS)
+    _check_metres(points)
     center = points.new_zeros(len(points), 3) if weight is None else _center(weight, points)
     apart = 0.0 if weight is None else weight.center_std
     errors = _Errors(placement, _tilts(tilt, points)[:, None], shift, turn, apart)
@@ -384,6 +387,19 @@ def _center(weight: CarriedWeight, points: Vectors) -> Float[Tensor, "b 3"]:
             allowed = f"one within {HOLD.farthest:g} m, in metres and in the frame of the contacts"
             raise BadArgument("weight.center", found, allowed)
     return center
+
+
+def _check_metres(points: Vectors) -> None:
+    """Raise `BadArgument` for contacts [m] so far apart that they are in another unit: errors in
+    metres would not count.
+    """
+    if not (is_known(points) and len(points)):
+        return
+    away = norm((points - points.mean(1, keepdim=True)).detach())
+    if bool((away > HOLD.farthest).any()):
+        found = f"a contact {float(away.max()):.3g} m off the middle of its set"
+        allowed = f"contacts within {HOLD.farthest:g} m of it, in metres"
+        raise BadArgument("contacts.points", found, allowed)
 
 
 def _tilts(tilt: float | Tensor, points: Vectors) -> Float[Tensor, "b f"]:
