@@ -1,5 +1,6 @@
 """Closings as LeRobot episodes: LeRobot's own loader reads offline what the simulation recorded."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,13 @@ def test_what_is_no_episode_is_refused_and_the_same_call_changes_nothing(
             write_lerobot(tmp_path / "bad", [good, ("", bad)], hand)
     with pytest.raises(BadArgument, match=r"episodes\[0\]"):
         write_lerobot(tmp_path / "bad", [good], load_hand("barrett"))
+    # one number would spoil the statistics of all episodes
+    for name in ("joints", "targets", "hand_pose", "object_pose"):
+        diverged = getattr(closing, name).clone()
+        diverged[5, 0] = torch.nan
+        lost = part(dataclasses.replace(closing, **{name: diverged}), slice(None))
+        with pytest.raises(BadArgument, match=rf"episodes\[1\]: .*{name} that are not finite"):
+            write_lerobot(tmp_path / "bad", [good, ("", lost)], hand)
     # forces would have the names of other fingers
     for fingers in (("index", "ring", "thumb"), ("thumb", "index", "middle")):
         with pytest.raises(BadArgument, match=r"episodes\[0\].*fingers index, middle, thumb$"):

@@ -57,6 +57,7 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
 
     Raises:
         BadArgument: there is no closing, or a closing has a single tick.
+        BadArgument: a closing has numbers that are not finite.
         BadArgument: a closing is of another hand or of other fingers, or has another control rate
             than the first one.
         OutputError: the folder holds other files, or cannot be written.
@@ -90,11 +91,30 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
                 "ticks or more, all at one rate"
             )
             raise BadArgument(f"episodes[{i}]", found, allowed)
+        _check_finite(f"episodes[{i}]", x)
     if not rates:
         raise BadArgument("episodes", "none", "at least one closing")
     files = dict(_files(episodes, hand, rates[0]))
     digest = hashlib.sha256(b"".join(x for x in files.values() if isinstance(x, bytes))).hexdigest()
     return write_folder(folder, {"torchgrasp": "lerobot", "frames_sha256": digest}, files.items())
+
+
+def _check_finite(name: str, closing: ClosureResult) -> None:
+    """Raise `BadArgument` for a closing with numbers that are not finite, as of a simulation that
+    diverged: a single one would spoil the statistics of the whole data set.
+    """
+    # a simulation that diverges ends with that tick, which has no observation
+    written = {
+        "joints": closing.joints[:-1],
+        "object_pose": closing.object_pose[:-1],
+        "trace.forces": closing.trace.forces[:-1],
+        "targets": closing.targets,
+        "hand_pose": closing.hand_pose,
+    }
+    wrong = [key for key, x in written.items() if not bool(torch.isfinite(x).all())]
+    if wrong:
+        found = f"{', '.join(wrong)} that are not finite, of status {closing.status.name}"
+        raise BadArgument(name, found, "finite numbers: leave out closings that diverged")
 
 
 def _files(episodes: Episodes, hand: Hand, rate: float) -> Iterator[tuple[str, str | bytes]]:
