@@ -10,8 +10,9 @@ import torch
 import trimesh
 
 from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
-from torchgrasp import PointCloud
+from torchgrasp import PointCloud, load_hand, load_object
 from torchgrasp.app import cli
+from torchgrasp.data import load_shipped_grasp
 from torchgrasp.evaluation import Touch, measure_touch
 from torchgrasp.evaluation.summary import ProtocolResult, ViewScore, summarise
 from torchgrasp.export import format_grasps
@@ -53,6 +54,19 @@ def test_gaps_are_those_of_a_box_and_of_a_sphere(name):
         assert np.abs(measure_touch(hand, grasp, box).gaps[0].numpy() - wanted).max() < 1e-6
         wanted = np.linalg.norm(centres - middle, axis=1) - 0.03 - radii
         assert np.abs(measure_touch(hand, grasp, ball).gaps[0].numpy() - wanted).max() < 5e-5
+
+
+def test_a_hand_of_other_fingers_is_refused():
+    """The joints of the middle finger would move the ring finger."""
+    jug = load_object("jug").mesh
+    grasp = load_shipped_grasp("jug", "allegro")
+    right = measure_touch(load_hand("allegro"), grasp, jug)
+    assert right.verdicts == ["touches"]
+    with pytest.raises(BadArgument, match=r"expected index,middle,thumb.*got index,ring,thumb"):
+        measure_touch(load_hand("allegro", ("index", "ring", "thumb")), grasp, jug)
+    # an import from elsewhere names no fingers
+    bare = dataclasses.replace(grasp, meta={})
+    assert torch.equal(measure_touch(load_hand("allegro"), bare, jug).gaps, right.gaps)
 
 
 def test_a_mesh_inside_out_or_in_millimetres_is_refused_and_an_open_one_is_not():

@@ -12,7 +12,7 @@ from torchgrasp.cloud.neighbours import usual_spacing
 from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import MeshError, SuspiciousScale
+from torchgrasp.foundation.errors import BadArgument, MeshError, SuspiciousScale
 from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.foundation.limits import MAX_EXTENT
 from torchgrasp.foundation.rules import ANY, SmallLength
@@ -132,9 +132,9 @@ def measure_touch(
         limit: largest size [m] of a gap of either sign at which a fingertip counts as touching, 0
             to 0.1.
 
-    Raises `BadArgument` for joints of another hand or beyond their limits, and for a cloud whose
-    normals cannot be estimated. Raises `MeshError` for a closed mesh with faces turned inward, and
-    `SuspiciousScale` for a mesh over 2 m.
+    Raises `BadArgument` for a hand or fingers that the grasps do not name, for joints beyond their
+    limits, and for a cloud whose normals cannot be estimated. Raises `MeshError` for a closed mesh
+    with faces turned inward, and `SuspiciousScale` for a mesh over 2 m.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -142,6 +142,7 @@ def measure_touch(
     >>> measure_touch(load_hand("allegro"), grasp, jug.mesh, limit=0.01).verdicts
     ['touches']
     """
+    _check_names(hand, grasps)
     hand = hand.to("cpu", torch.float64)
     joints = hand.check_joints(grasps.joints.detach().double().cpu())
     centres = apply(grasps.obj_from_hand.detach().double().cpu(), hand.tip_centres(joints))
@@ -155,6 +156,18 @@ def measure_touch(
         distance = surface_distance(vertices, faces)
         heights = torch.from_numpy(distance(points.numpy()))
     return Touch(heights.reshape(centres.shape[:-1]) - hand.tip_radius, limit)
+
+
+def _check_names(hand: Hand, grasps: Grasps) -> None:
+    """Raise `BadArgument` for a hand of another name, or of other fingers, than the grasps name. The
+    joints of one finger would move another.
+    """
+    ours = {"hand": hand.name, "finger_names": ",".join(hand.finger_names)}
+    for name, own in ours.items():
+        planned = grasps.meta.get(name, own)
+        if planned != own:
+            allowed = f"{planned}, as the grasps name: `hand_of(grasps)` loads it"
+            raise BadArgument("hand", own, allowed)
 
 
 def _check_sides(mesh: "trimesh.Trimesh") -> None:
