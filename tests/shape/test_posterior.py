@@ -19,7 +19,7 @@ from tests.make import (
     queries,
     real,
 )
-from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
+from torchgrasp.foundation.errors import BadArgument, CloudWarning, IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.conditioning import append_observations, posterior_given
 from torchgrasp.shape.estimate import Observations
@@ -208,3 +208,18 @@ def test_bad_updates_and_samples_are_named():
         shape.joint(on.expand(1001, 3))
     assert shape.joint(on[:0]).covariance.shape == (0, 0)
     assert shape.sample(on[:0], 2).shape == (2, 0, 4)
+
+
+def test_touched_normals_that_point_inward_are_told_and_noise_is_in_metres(recwarn):
+    """The normals of a hand's fingertips point into the object: they would turn the surface."""
+    shape = fit_half_sphere(half_sphere())
+    touched = shape.metres(unit(real([[1.0, 0.2, 0.1], [0.9, -0.3, 0.2]])))
+    outward = shape.predict(touched).normal
+    shape.update(touched, outward)
+    # the inner wall of a cup that was taken for a solid one
+    shape.update(shape.metres(0.7 * shape.normalise(touched)), -outward)
+    assert not recwarn.list
+    with pytest.warns(CloudWarning, match="normals: they point into the shape"):
+        shape.update(touched, -outward)
+    with pytest.raises(BadArgument, match=r"^noise: expected a number in .*0\.1\], got 1"):
+        shape.update(touched, noise=1.0)  # a millimetre

@@ -83,8 +83,9 @@ Pose = Annotated[Float[Tensor, "4 4"], RIGID]  # a rigid transform
 Poses = Annotated[Float[Tensor, "g 4 4"], RIGID]  # a rigid transform for each row
 Force = Annotated[float, Range(0.01, 100.0)]  # a normal force [N] of a finger
 Length = Annotated[float, Range(0.0, 10.0)]  # a length [m] within reach
-# a length [m] of the size of a fingertip: one of some millimetres, which is given as 3, is refused
-SmallLength = Annotated[float, Range(0.0, 0.1)]
+# greatest length [m] of the size of a fingertip: one of some millimetres, given as 3, is refused
+SMALL = 0.1
+SmallLength = Annotated[float, Range(0.0, SMALL)]
 # a displacement [m] of an object of a hand's size; one in millimetres or centimetres is refused
 Displacement = Annotated[float, Range(0.0, 0.5)]
 DTYPES = {

@@ -15,10 +15,20 @@ from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.cloud.registration import VIEWS, compare_with
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import check_tensor, checked
-from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import Pose, Positive, Range, Seed, check_moved, is_known
+from torchgrasp.foundation.errors import BadArgument, CloudWarning
+from torchgrasp.foundation.rules import (
+    LEAST,
+    SMALL,
+    Pose,
+    Positive,
+    Range,
+    Seed,
+    check_moved,
+    is_known,
+)
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply
-from torchgrasp.geometry.linalg import Points, cholesky, norm, unit, unit_of_any
+from torchgrasp.geometry.linalg import Points, cholesky, dot, norm, unit, unit_of_any
 from torchgrasp.geometry.plane import move
 from torchgrasp.shape.conditioning import append_observations
 from torchgrasp.shape.estimate import (
@@ -45,6 +55,12 @@ class DomainNumbers:
     compared: int = 300
     """Greatest number of points at which errors of poses are compared with the shape's deviations.
     """
+    touched: float = 1.0
+    """Greatest distance of a touched point from the shape's surface, in standard deviations, at
+    which the normals there are compared.
+    """
+    inward: float = -0.8
+    """Mean cosine of given normals with those of the shape, below which they all point inward."""
 
 
 DOMAIN = DomainNumbers()
@@ -322,7 +338,7 @@ class ShapeGP(Posterior, Normalisation):
         points: Float[Tensor, "m 3"],
         normals: Float[Tensor, "m 3"] | None = None,
         *,
-        noise: Positive = 0.001,
+        noise: Annotated[float, Range(LEAST, SMALL)] = 0.001,
         normal_noise: Positive = 0.05,
     ) -> "ShapeGP":
         """Return the shape given m more surface points, such as a finger's touch or a second view.
@@ -338,8 +354,10 @@ class ShapeGP(Posterior, Normalisation):
         Args:
             points: surface points (m, 3) [m] in the cloud's frame.
             normals: outward normals (m, 3) of any length, or None if they are unknown.
-            noise: standard deviation [m] of a point along the normal.
+            noise: standard deviation [m] of a point along the normal, up to 0.1.
             normal_noise: standard deviation of the components of a unit normal (no unit).
+
+        Warns (`CloudWarning`) of normals that point into the shape, as those of fingertips do.
 
         Raises `BadArgument` for a wrong argument, a normal of length 0, or a point outside the
         domain. It is also raised for a view that is farther from `cloud` than about three times the
@@ -357,6 +375,7 @@ class ShapeGP(Posterior, Normalisation):
         if normals is not None:
             direction = unit_of_any(normals.to(x))
             check_tensor("normals", direction, (len(x), 3))  # a normal of length 0 has become NaN
+            self._warn_of_inward(points, direction)
         error = 0.0
         if self.cloud.normals is not None and len(x) >= VIEWS.least:
             facing = self.predict(points).normal if normals is None else unit_of_any(normals)
@@ -366,6 +385,17 @@ class ShapeGP(Posterior, Normalisation):
         has_normal = new.has_normal & (normals is not None)
         shape = self.append(dataclasses.replace(new, has_normal=has_normal))
         return shape if error == 0 else shape.widened(points, torch.full_like(x[:, 0], error))
+
+    def _warn_of_inward(self, points: Points, direction: Points) -> None:
+        """Warn if the unit normals `direction` of touched points on the known surface point into
+        the shape. A touch within it may be one of another wall.
+        """
+        known = self.predict(points.double(), covariance=False)
+        near = (known.distance * self.scale).abs() < DOMAIN.touched * known.std_m
+        cosine = dot(direction.to(known.normal), known.normal)[near]
+        if len(cosine) and float(cosine.mean()) < DOMAIN.inward:
+            advice = "give outward ones, or none; those of a fingertip point into the object"
+            warn_user(CloudWarning, f"normals: they point into the shape: {advice}")
 
     @checked
     def widened(self, points: Points, error: Float[Tensor, "n"]) -> "ShapeGP":
