@@ -431,10 +431,8 @@ class ShapeGP(Posterior, Normalisation):
         is valid. `update` does the same for points [m].
 
         Raises `IndefiniteCovariance` if the covariance of the observations is not positive
-        definite. It may be so for observations far outside the domain. Raises `BadArgument` for an
-        observed normal that is no unit vector.
+        definite. It may be so for observations far outside the domain.
         """
-        new.check_normals()
         return dataclasses.replace(self, **common_fields(append_observations(self, new), Posterior))
 
     @checked

@@ -218,8 +218,7 @@ class HollowShape(ShapeGP):
         domain, the ball in which the posterior is valid, do not change.
 
         Raises `IndefiniteCovariance` if the covariance of the observations is not positive
-        definite. It may be so for observations far outside the domain. Raises `BadArgument` for an
-        observed normal that is no unit vector.
+        definite. It may be so for observations far outside the domain.
         """
         outer, inner = self.wall_at(new.x).T
         new_outer = self.outer.append(new[outer])
