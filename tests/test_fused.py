@@ -463,6 +463,22 @@ def test_a_numba_that_cannot_be_imported_is_no_numba_that_is_missing(tmp_path, m
         fused.inlined(both)
 
 
+def test_compilation_of_loops_is_told_once_and_loading_is_silent(tmp_path, monkeypatch):
+    """A first plan that takes a minute more would look broken."""
+    pytest.importorskip("numba")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv(fused.VARIABLE, "1")
+    code = """if True:
+        import torch
+        from torchgrasp.geometry.linalg import farthest_points
+        points = torch.arange(24.0, dtype=torch.float64).view(8, 3)
+        farthest_points(points, 3)
+        farthest_points(points[:4], 3)
+    """
+    told = [run_python("-c", code).stderr.count("compiling loops, once") for _ in range(2)]
+    assert told == [1, 0]
+
+
 def test_loops_need_no_folder_for_machine_code():
     """A function that is in no file has none."""
     names = {}

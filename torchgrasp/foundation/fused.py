@@ -12,6 +12,7 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
+import logging
 import os
 from typing import Any
 
@@ -28,6 +29,7 @@ numba is installed.
 """
 LEAST_NUMBA = 0, 61
 """Least version of numba; that of the extra `fast`."""
+_log = logging.getLogger(__name__)
 REORDERED = {"reassoc", "contract", "nsz"}
 """What the compiler may change: the order of sums, so that it can use vector instructions."""
 
@@ -112,7 +114,34 @@ def _compile(function: Any, **options: Any) -> Any:
         import numba  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         return plain
+    _tell_of_compilation()
     return numba.njit(error_model="numpy", fastmath=REORDERED, **options)(plain)
+
+
+@functools.cache
+def _tell_of_compilation() -> None:
+    """Log one line when numba begins to compile loops of the library: it takes up to a minute.
+
+    Machine code that is found on the disk is loaded without a word.
+    """
+    event = importlib.import_module("numba.core.event")
+
+    class Listener(event.Listener):
+        """Hears of each function that numba begins to compile."""
+
+        def __init__(self) -> None:
+            self.told = False
+
+        def on_start(self, event: Any) -> None:
+            module = event.data["dispatcher"].py_func.__module__
+            if not self.told and module.startswith("torchgrasp."):
+                self.told = True
+                _log.warning("compiling loops, once on this machine; it takes up to a minute")
+
+        def on_end(self, event: Any) -> None:
+            """Do nothing."""
+
+    event.register("numba:compile", Listener())
 
 
 def _content(function: Any) -> bytes:

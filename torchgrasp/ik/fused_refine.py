@@ -372,17 +372,16 @@ def _solve(h, parts, n, joints, poses, target, normals, residual, jacobian):
         np.zeros(hinges, np.int64),
     )
     for g in range(len(joints)):
-        own = (target[g], normals[g], room)
-        cost = _evaluate(h, parts, n, joints[g], poses[g], *own, residual[g], jacobian[g])
+        copy(new_joints, joints[g])
+        copy(new_pose, poses[g])
+        cost = math.inf
         damping = n.first
-        for _ in range(n.steps):
-            if cost < n.solved or damping == math.inf:
-                break
-            _step(n, damping, len(h.tip_link), residual[g], jacobian[g], matrix, x)
-            _move(h, joints[g], poses[g], x, new_joints, new_pose)
-            new = _evaluate(h, parts, n, new_joints, new_pose, *own, trial[0], trial[1])
-            if new < cost:
-                rests = new > (1 - n.stalled) * cost
+        for k in range(n.steps + 1):
+            # the only call, at the start and after each step: each would be compiled in full
+            own = (new_joints, new_pose, target[g], normals[g], room, trial[0], trial[1])
+            new = _evaluate(h, parts, n, *own)
+            if k == 0 or new < cost:
+                rests = k > 0 and new > (1 - n.stalled) * cost
                 after = damping / n.fall
                 cost = new
                 copy(joints[g], new_joints)
@@ -392,7 +391,12 @@ def _solve(h, parts, n, joints, poses, target, normals, residual, jacobian):
             else:
                 rests = damping > n.lost
                 after = damping * n.rise
-            damping = math.inf if rests else min(max(after, n.least), n.most)
+            if k > 0:
+                damping = math.inf if rests else min(max(after, n.least), n.most)
+            if k == n.steps or cost < n.solved or damping == math.inf:
+                break
+            _step(n, damping, len(h.tip_link), residual[g], jacobian[g], matrix, x)
+            _move(h, joints[g], poses[g], x, new_joints, new_pose)
 
 
 def solve(

@@ -5,6 +5,7 @@ does the work.
 import contextlib
 import contextvars
 import dataclasses
+import logging
 import os
 import shlex
 import sys
@@ -188,6 +189,10 @@ def _speaking(command: Command) -> Iterator[None]:
         words = sys.stderr
         if quiet:
             words = stack.enter_context(open(os.devnull, "w"))
+            # that loops are compiled is no warning
+            loops = logging.getLogger("torchgrasp.foundation.fused")
+            stack.callback(loops.setLevel, loops.level)
+            loops.setLevel(logging.ERROR)
         stack.enter_context(contextlib.redirect_stdout(words))
         yield
 
