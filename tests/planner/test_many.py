@@ -2,6 +2,8 @@
 processes.
 """
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -44,6 +46,15 @@ def test_processes_change_nothing(found):
     assert torch.get_num_threads() == 1 or pytest.skip("workers have one thread")
     again = plan_grasps([VIEWS[0], SMALL, VIEWS[1]], HAND, SPEC, 6, workers=2)
     assert all(same(one, other) for one, other in zip(again, found, strict=True))
+
+
+def test_processes_refuse_a_hand_that_is_not_as_in_its_files():
+    """They read the files, and would plan with wider limits."""
+    pytest.importorskip("pebble")
+    actuated = dataclasses.replace(HAND.actuated, upper=HAND.lower + 0.1)
+    narrow = dataclasses.replace(HAND, actuated=actuated)
+    with pytest.raises(BadArgument, match="it is read again here"):
+        plan_grasps(VIEWS, narrow, SPEC, 2, workers=1)
 
 
 def test_what_no_row_can_have_is_refused_before_any_work():

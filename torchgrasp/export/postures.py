@@ -179,7 +179,7 @@ def check_all_executable(grasps: Grasps) -> None:
     if failed:
         causes = ", ".join(f"{k} {s.name}" for s, k in failed.items())
         found = f"{sum(failed.values())} of {len(grasps)} that failed ({causes})"
-        allowed = "executable grasps, as grasps[grasps.status == Status.OK] or grasps.best"
+        allowed = "executable grasps, as grasps.executable or grasps.best"
         raise BadArgument("grasps", found, allowed)
 
 

@@ -146,7 +146,7 @@ def plan_grasps(
         Grasps: executable ones (all checks passed) first, best first; if none, see `explain_empty`.
 
     Raises:
-        BadArgument: an argument of the wrong type or range; a bad file of cloud or hand.
+        BadArgument: a wrong type or range; a bad file; with `workers`, a hand unlike its files.
         BadArgument: an object of no graspable size; no target; a camera that cannot have seen it.
         BadArgument: a table above most points or a camera, or over 2 m below the top; `keep` off
             the object; an `arm` of another hand; a `promise` with `GraspTask.displaced`.

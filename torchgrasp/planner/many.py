@@ -15,7 +15,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra, Status, one_line
 from torchgrasp.foundation.jobs import pack, run_tasks, unpack
 from torchgrasp.hand.hand import Hand, HandSource
-from torchgrasp.hand.load import load_hand
+from torchgrasp.hand.load import check_as_loaded, load_hand
 from torchgrasp.planner.objects import Objects, join_objects, pose_request, settle_hand
 from torchgrasp.planner.planner import plan_objects
 from torchgrasp.planner.request import Request
@@ -203,6 +203,7 @@ def _each(
         yield from map(call, requests)
         return
     hand = requests[0].hand
+    check_as_loaded(hand)  # each process reads the files
     # without the caches
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     tasks = ((call, source, pack(dict(vars(request), hand=None))) for request in requests)
