@@ -97,7 +97,7 @@ class Report:
         self.ended += 1
         if self.ended < self.batches:
             good = int(is_executable(grasps).sum())
-            best = f", the best {format_success(grasps)} likely" if good else ""
+            best = f", success of the best {format_success(grasps)}" if good else ""
             text = f"{self.ended} of {self.batches}: {good} executable of {len(grasps)}{best}"
             self.objects.tell("batch", text, grasps)
         if last and len(self.parts["plan"]) < self.planned:
