@@ -68,7 +68,7 @@ def test_grasps_that_failed_are_written_only_where_their_status_is(tmp_path):
             write(plan)
     assert list(tmp_path.iterdir()) == []
     for write in writers.values():
-        write(plan[plan.status == Status.OK])
+        write(plan.executable)
         write(plan.best)
     told = json.loads(format_grasps(hand, plan))["grasps"]
     assert [x["status"] for x in told] == [x.name for x in statuses]
@@ -221,6 +221,16 @@ def test_a_trajectory_each_goes_from_pregrasp_to_squeeze():
     )
     none = grasp[torch.zeros(0, dtype=torch.int64)]
     assert yaml.safe_load(format_moveit(hand, none)) == []
+
+
+def test_imported_grasps_are_written_though_the_pads_do_not_prove_closure_but_planned_ones_are_not():
+    hand, one = pinch("barrett")
+    imported = grasps_from_joints(hand, one.joints, one.obj_from_hand)
+    assert imported.status.tolist() == [int(Status.NOT_CLOSED)]
+    assert yaml.safe_load(format_isaac(hand, imported))["grasps"]
+    planned = dataclasses.replace(imported, meta=imported.meta | {"seed": "0"})
+    with pytest.raises(BadArgument, match="1 of 1 that failed"):
+        format_isaac(hand, planned)
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])

@@ -327,9 +327,8 @@ class ContactProblem:
     of the shape. `separation` is the least distance of two fingertip centres, and `tip_radius` the
     radius of the fingertips. `ring` is the radius around a contact within which the surface must be
     flat. `table` holds the top of the table, then its side if it has an edge. It is empty without
-    a table. `beyond`
-    returns the signed distance (q,) of normalised points (q, 3) from the region where contacts may
-    be, negative inside.
+    a table. `beyond` returns the signed distance (q,) of normalised points (q, 3) from the region
+    where contacts may be, negative inside.
     """
 
     spec: ContactSpec
