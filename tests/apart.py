@@ -7,13 +7,14 @@ import contextlib
 import io
 import logging
 
+from torchgrasp.foundation import fused
 from torchgrasp.foundation.jobs import run_tasks
 
 
 def execute(code: str) -> str:
     """Run a text of Python; return what it says on either stream."""
     # whether loops are compiled, or loaded from the disk, depends on the tests before
-    logging.getLogger("torchgrasp.foundation.fused").setLevel(logging.ERROR)
+    logging.getLogger(fused.__name__).setLevel(logging.ERROR)
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         exec(code, {"__name__": "apart"})

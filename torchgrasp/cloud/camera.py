@@ -133,12 +133,8 @@ def partial_view(
     500
     """
     pose = check_rigid("camera_pose", camera_pose).double()
+    _check_outside(mesh, pose)
     depth, cosine = cast_mesh(mesh, pose)
-    low, high = torch.from_numpy(np.array(mesh.bounds))
-    eye = pose[:3, 3].cpu()
-    if bool(((low < eye) & (eye < high)).all()):
-        found = f"a camera within the mesh's box, which is {float((high - low).max()):.4g} m long"
-        raise BadArgument("camera_pose", found, "a camera outside the object, both in metres")
     generator = torch.Generator().manual_seed(seed)
     sensor = find_sensor(noise)
     if sensor is not None:
@@ -147,6 +143,17 @@ def partial_view(
     if sensor is not None:
         cloud = _crop_and_move(cloud, float(mesh.bounds[0, 2]), sensor, generator)
     return cloud.select(torch.randperm(len(cloud), generator=generator)[:n])
+
+
+def _check_outside(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> None:
+    """Raise `BadArgument` for a camera within the box of a mesh [m], as of one in millimetres."""
+    if not len(mesh.faces):
+        return  # no box: `cast_mesh` refuses such a mesh
+    low, high = torch.from_numpy(np.array(mesh.bounds))
+    eye = obj_from_camera[:3, 3].cpu()
+    if bool(((low < eye) & (eye < high)).all()):
+        found = f"a camera within the mesh's box, which is {float((high - low).max()):.4g} m long"
+        raise BadArgument("camera_pose", found, "a camera outside the object, both in metres")
 
 
 def _crop_and_move(

@@ -23,7 +23,7 @@ from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.linalg import dot, norm, unit
 from torchgrasp.shape.estimate import surface_deviation
-from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.gp import DOMAIN, ShapeGP
 from torchgrasp.shape.posterior import combined_covariance, symmetric_root
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Contacts
@@ -34,8 +34,6 @@ from torchgrasp.values.specs import ContactSpec
 FOOTPRINT = 0.012
 # nodes of a line, in standard deviations of the surface at its contact
 NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
-# mean cosine of the contacts' normals with those of the shape, below which they all point inward
-INWARD = -0.8
 LINES = 32  # contact sets whose covariances are computed at a time: they stay in the cache
 DRAWS = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
 DRAWS_ON_GPU = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB
@@ -149,7 +147,7 @@ def _check_outward(normals: Vectors, slope: Vectors) -> None:
     as those of poor contacts.
     """
     cosines = dot(normals, unit(slope)).detach()
-    if is_known(cosines) and len(cosines) and float(cosines.mean()) < INWARD:
+    if is_known(cosines) and len(cosines) and float(cosines.mean()) < DOMAIN.inward:
         found = "normals that point into the shape"
         raise BadArgument("contacts.normals", found, "outward normals, so perhaps -normals")
 

@@ -124,9 +124,9 @@ def _tell_of_compilation() -> None:
 
     Machine code that is found on the disk is loaded without a word.
     """
-    event = importlib.import_module("numba.core.event")
+    events = importlib.import_module("numba.core.event")
 
-    class Listener(event.Listener):
+    class Listener(events.Listener):
         """Hears of each function that numba begins to compile."""
 
         def __init__(self) -> None:
@@ -141,7 +141,7 @@ def _tell_of_compilation() -> None:
         def on_end(self, event: Any) -> None:
             """Do nothing."""
 
-    event.register("numba:compile", Listener())
+    events.register("numba:compile", Listener())
 
 
 def _content(function: Any) -> bytes:

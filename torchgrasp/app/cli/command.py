@@ -19,6 +19,7 @@ import tyro
 from tqdm import tqdm
 
 from torchgrasp.files import format_json
+from torchgrasp.foundation import fused
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, check_path, describe
 
@@ -190,7 +191,7 @@ def _speaking(command: Command) -> Iterator[None]:
         if quiet:
             words = stack.enter_context(open(os.devnull, "w"))
             # that loops are compiled is no warning
-            loops = logging.getLogger("torchgrasp.foundation.fused")
+            loops = logging.getLogger(fused.__name__)
             stack.callback(loops.setLevel, loops.level)
             loops.setLevel(logging.ERROR)
         stack.enter_context(contextlib.redirect_stdout(words))
