@@ -19,6 +19,7 @@ from torchgrasp import (
     plan_grasps,
 )
 from torchgrasp.app.report.run_data import grasp_columns, grasp_rows
+from torchgrasp.contacts.balance import least_friction_forces
 from torchgrasp.export import format_grasps
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
@@ -36,6 +37,7 @@ from torchgrasp.success.model import load_success_model
 from torchgrasp.success.task import Conditions, loads_of
 
 HAND = load_hand("allegro")
+EFFORT = real([HAND.actuators[name].effort for name in HAND.joint_names])
 VIEW = load_object("jug").view
 FRAME = random_motion(7)
 SPEC = ContactSpec(table=Plane.horizontal(0.0).moved(FRAME))
@@ -195,28 +197,57 @@ def test_the_hand_tries_the_contact_sets_that_resist_with_the_greatest_forces_an
     assert torch.equal(found.contacts.points, plan.contacts.points[rows[resisting]])
 
 
-def test_contact_sets_and_postures_that_resist_the_worst_load_come_first(steered):
-    found = with_costs(steered[0], steered[-1])
-    cost = found.cost
-    seeds = found.seeds
-    contacts = assign(found.contacts, found.seeds)
+def turning(seeds, contacts, forces):
+    """The torques (g, h) [N m] of the joints by forces at the contacts, by each finger (g, f, h)."""
     hand_from_obj = inverse(seeds.obj_from_hand)
     jacobian = HAND.jacobian(seeds.joints, apply(hand_from_obj, contacts.points))
-    torque = torch.einsum("gfih,gfi->gfh", jacobian, rotate(hand_from_obj, contacts.normals)).abs()
-    strength = (
-        (real([HAND.actuators[name].effort for name in HAND.joint_names]) / torque)
-        .amin(-1)
-        .clamp(max=15)
-    )
+    return torch.einsum("gfih,gfi->gfh", jacobian, rotate(hand_from_obj, forces))
+
+
+def shares_of(found, seeds):
+    """The share of its set's load that each posture carries, at most 1, by HiGHS."""
+    contacts = assign(found.contacts, seeds)
+    torque = turning(seeds, contacts, contacts.normals).abs()
+    strength = (EFFORT / torque).amin(-1).clamp(max=15)
     points = contacts.points - contacts.points.mean(1, keepdim=True)
     loads = found.load[seeds.row]
     rows = zip(points, contacts.normals, strength.numpy(), loads.numpy(), strict=True)
-    margins = real([by_highs(*row) for row in rows]).clamp(max=1)
-    of_sets = [margins[seeds.row == row] for row in range(len(cost))]
+    return real([by_highs(*row) for row in rows]).clamp(max=1)
+
+
+def test_contact_sets_and_postures_that_resist_the_worst_load_come_first(steered):
+    found = with_costs(steered[0], steered[-1])
+    cost = found.cost
+    margins = shares_of(found, found.seeds)
+    of_sets = [margins[found.seeds.row == row] for row in range(len(cost))]
     assert all(bool((margin.diff() < 1e-9).all()) for margin in of_sets)
     good = torch.stack([margin[0] == 1 for margin in of_sets])
     assert 0 < int(good.sum()) < len(good)
     assert float(cost[good].max()) < float(cost[~good].min())
+
+
+def test_of_postures_that_resist_the_nearest_is_tried_first_and_then_the_strongest(steered):
+    before = steered[-1]
+    share = shares_of(before, before.seeds)
+    found = with_costs(steered[0], before)
+    seeds = found.seeds
+    contacts = assign(found.contacts, seeds)
+    forces = least_friction_forces(contacts.points, contacts.normals, strongest=1.0)
+    strength = (EFFORT / turning(seeds, contacts, forces).sum(1).abs()).amin(1).clamp(max=15)
+    second = list[float]()
+    others = list[float]()
+    for row in range(len(found)):
+        at = torch.nonzero(seeds.row == row)[:, 0]
+        old = torch.nonzero(before.seeds.row == row)[:, 0]
+        assert sorted(seeds.energy[at].tolist()) == sorted(before.seeds.energy[old].tolist())
+        good = old[share[old] == 1]
+        if len(good):
+            assert torch.equal(seeds.joints[at[0]], before.seeds.joints[good[0]])
+        if len(good) > 2:
+            second.append(float(strength[at[1]]))
+            others.append(float(strength[at[2 : len(good)]].mean()))
+    assert len(second) > 5
+    assert float(real(second).mean()) > 1.1 * float(real(others).mean())
 
 
 def test_a_lift_is_less_likely_where_no_forces_with_all_friction_carry_the_weight():

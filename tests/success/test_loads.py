@@ -16,7 +16,14 @@ from tests.success.scenes import around, grasps_at
 from torchgrasp.contacts.balance import least_friction_forces, tangential_ratio
 from torchgrasp.geometry.frames import apply, inverse, rotate, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.success.loads import carrying_force, greatest_force, lever_arm, log_odds_about
+from torchgrasp.success.loads import (
+    carrying_force,
+    greatest_force,
+    lever_arm,
+    log_odds_about,
+    squeezing_forces,
+    squeezing_strength,
+)
 from torchgrasp.values.planning import Contacts
 
 
@@ -153,3 +160,42 @@ def test_log_odds_about_other_centres_fall_with_their_distance_from_the_contacts
     near(log_odds_about(grasps[1:], aside, 0.9, (0.0, 0.0, -1.0)), found[1:], 1e-9)
     rounded = log_odds_about(grasps.to(torch.float32), aside, 0.9, (0.0, 0.0, -1.0))
     near(rounded, found, 1e-2)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+def test_squeezing_forces_balance_and_push_everywhere_and_those_of_three_contacts_need_little_friction(
+    count, generator
+):
+    points = torch.randn(60, count, 3, generator=generator, dtype=torch.float64)
+    normals = unit(points + 0.4 * torch.randn(60, count, 3, generator=generator).double())
+    contacts = Contacts(0.05 * points, normals)
+    forces = squeezing_forces(contacts)
+    found = torch.isfinite(forces).flatten(1).all(1)
+    assert int(found.sum()) > 30
+    forces = forces[found]
+    points, normals = contacts.points[found], normals[found]
+    zero = torch.zeros_like(forces[:, 0])
+    near(forces.sum(1), zero, 1e-9)
+    near(torch.linalg.cross(points, forces).sum(1), zero, 1e-9)
+    push = -(forces * normals).sum(-1)
+    assert float(push.min()) > 0
+    near(push.amax(1), torch.ones_like(push[:, 0]), 1e-9)
+    best = tangential_ratio(least_friction_forces(points, normals), normals).amax(1)
+    needed = tangential_ratio(forces, normals).amax(1)
+    if count == 3:  # of more contacts the short search finds a rough guess
+        assert float((needed - best)[best < 0.6].median()) < 0.1
+
+
+def test_contacts_that_cannot_be_squeezed_have_no_strength_and_others_what_the_drives_allow():
+    hand, grasp = pinch("allegro")
+    contacts = grasp.contacts
+    forces = squeezing_forces(contacts)
+    strength = squeezing_strength(hand, grasp, contacts, forces, 100.0)
+    near(strength, greatest_force(hand, grasp, forces), 1e-9)
+    assert float(squeezing_strength(hand, grasp, contacts, forces, 0.5)) == 0.5
+    # all normals point up, so no forces that push balance
+    upward = torch.zeros_like(contacts.normals)
+    upward[..., 2] = 1.0
+    flat = dataclasses.replace(contacts, normals=upward)
+    assert bool(squeezing_forces(flat).isnan().all())
+    assert float(squeezing_strength(hand, grasp, flat, squeezing_forces(flat), 100.0)) == 0.0

@@ -112,18 +112,22 @@ def is_executable(grasps: Grasps) -> Bool[Tensor, "g"]:
     return grasps.status == Status.OK
 
 
-def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
+def best_grasps(
+    attempts: Attempts[Grasps],
+    worth: Callable[[Grasps], Float[Tensor, "k"]] = lambda grasps: grasps.score,
+) -> tuple[Grasps, Int[Tensor, "t"]]:
     """Return the best grasp of each contact set that has a grasp in `attempts`, t in all. Return
     then the indices (t,) of these contact sets.
 
     An executable grasp is best. Next is a failed grasp whose contacts violate no constraint, then
-    any other. In a tie the higher `score` decides.
+    any other. In a tie the higher `worth` decides, a number (k,) of each of k grasps. It is the
+    `score` by default.
     """
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
         failed = ~is_executable(grasps)
         bad_contacts = failed & (grasps.status < Status.OUT_OF_REACH)
-        return failed.int() + bad_contacts.int(), -grasps.score
+        return failed.int() + bad_contacts.int(), -worth(grasps)
 
     return attempts.best(keys)
 

@@ -55,6 +55,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import Mesh, collision_field, extract_mesh
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import GRIP, weight_about
+from torchgrasp.success.loads import squeezing_forces, squeezing_strength
 from torchgrasp.success.promise import describe_promise
 from torchgrasp.success.task import loads_of
 from torchgrasp.values.distribution import Distribution
@@ -220,6 +221,12 @@ class Objects:
     def strongest(self) -> float:
         """The greatest normal force [N] with which a finger presses in the task."""
         return self.request.grasp_task.pressing(self.lifts) or GRIP
+
+    def strength(self, grasps: Grasps) -> Float[Tensor, "g"]:
+        """Return how hard [N] the hand can squeeze in each of g grasps, at most `strongest`."""
+        contacts = grasps.contacts
+        forces = squeezing_forces(contacts)
+        return squeezing_strength(self.hand, grasps, contacts, forces, self.strongest)
 
     @property
     def lifts(self) -> bool:

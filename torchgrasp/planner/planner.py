@@ -186,7 +186,8 @@ def solve_fixed(
     """
     contacts, certificate, seeds = rows.select(now)
     reach = objects.reach(contacts, certificate, rows.cloud[now])
-    grasps, row = best_grasps(try_best_seeds(reach, seeds, steps))
+    # the contacts of a set are the same in all its grasps, so strength decides
+    grasps, row = best_grasps(try_best_seeds(reach, seeds, steps), objects.strength)
     solved = is_executable(grasps)
     status = torch.where(solved, int(Row.ENDED), int(failed))
     return rows.put(now[row], grasps, status), now[row[solved]]

@@ -33,7 +33,12 @@ from torchgrasp.ik.attempts import assign, seed_costs
 from torchgrasp.ik.seeds import nearest_postures, query_mixture
 from torchgrasp.planner.objects import CloudIndex, Objects
 from torchgrasp.posture_model.mixture import PAPER_ENERGY
-from torchgrasp.success.loads import lever_arm, strength_of
+from torchgrasp.success.loads import (
+    lever_arm,
+    squeezing_forces,
+    squeezing_strength,
+    strength_of,
+)
 from torchgrasp.values.planning import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
 from torchgrasp.values.specs import ContactSpec
 
@@ -353,21 +358,21 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     lever arm of the set's load, without unit (`lever_arm`). The number e [mm2] is the least cost of
     its first two initial postures (`seed_costs`), and infinite without any.
 
-    With loads to resist, or a weight to lift, the initial postures of each set are sorted first.
-    Those that carry the greatest share of the load, at most 1, come first. A set whose postures all
-    carry less than the load costs 1e6 to 2e6 more (`CHOICE.weak`). A weight is carried with the
-    whole mean friction. Without this, two fingers at a thin wall and one on the floor of a pan
-    would do.
+    The initial postures of each set are sorted first (`_sort_seeds`). With loads to resist, or a
+    weight to lift, a set whose postures all carry less than the load costs 1e6 to 2e6 more
+    (`CHOICE.weak`). A weight is carried with the whole mean friction. Without this, two fingers at
+    a thin wall and one on the floor of a pan would do.
     """
     contacts = found.contacts
     seeds = found.seeds
     weak = torch.zeros_like(found.certificate.margin)
+    share = torch.ones_like(seeds.energy)
     if objects.lifts or objects.loads is not None:
         spec = objects.slipping if objects.loads is None else objects.spec
         share = _carried(objects, found, spec)
         weak = weak.scatter_reduce(0, seeds.row, share, "amax")
         weak = torch.where(weak < 1, CHOICE.weak * (2 - weak), 0.0)
-        seeds = seeds[lexical_order(seeds.row, -share)]
+    seeds = _sort_seeds(objects, found, share)
     first = seeds[rank_in_group(seeds.row) < CHOICE.tried]
     reach = objects.reach(contacts, found.certificate, found.cloud)
     residual = seed_costs(reach, first)
@@ -377,6 +382,24 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     missed = least.clamp_min(CHOICE.touching).log()
     cost = missed + CHOICE.lever * (arm + CHOICE.short).log() + weak
     return dataclasses.replace(found, seeds=seeds, cost=cost)
+
+
+def _sort_seeds(objects: Objects, found: Candidates, share: Float[Tensor, "g"]) -> IKSeeds:
+    """Return the initial postures of each contact set in the order in which they are tried.
+
+    Those that carry the greatest `share` of the load (at most 1) come first, and the nearest of
+    them first of all: it is most likely to reach the contacts. The others with this share follow,
+    the strongest first (`squeezing_strength`). On the same contacts, one posture may squeeze twice
+    as hard as another.
+    """
+    contacts = found.contacts
+    seeds = found.seeds
+    forces = squeezing_forces(contacts)[seeds.row[:, None], seeds.permutation]
+    strength = squeezing_strength(
+        objects.hand, seeds, assign(contacts, seeds), forces, objects.strongest
+    )
+    further = (rank_in_group(seeds.row, -share) > 0).int()
+    return seeds[lexical_order(seeds.row, further, -share, -strength)]
 
 
 def _carried(objects: Objects, found: Candidates, spec: ContactSpec) -> Float[Tensor, "g"]:

@@ -9,10 +9,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.contacts.balance import grasp_map, least_friction_forces
+from torchgrasp.contacts.balance import (
+    forces_near,
+    grasp_map,
+    least_friction_forces,
+)
 from torchgrasp.contacts.form_closure import cone_edges, tangents
+from torchgrasp.contacts.problem import contact_pairs
 from torchgrasp.geometry.frames import apply, inverse, rotate, skew, subsets
-from torchgrasp.geometry.linalg import norm, unit
+from torchgrasp.geometry.linalg import dot, norm, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 
@@ -112,7 +117,49 @@ def greatest_force(
     The forces (g, f, 3) act at the f contacts of each grasp, in the frame of the grasps. Forces
     that are NaN give NaN.
     """
-    jacobian, pushes, effort = _levers(hand, grasps, grasps.contacts, forces)
+    return _most_times(hand, grasps, grasps.contacts, forces)
+
+
+def squeezing_forces(contacts: Contacts) -> Float[Tensor, "b f 3"]:
+    """Return balanced forces [N] with which f fingers squeeze an object at each of b contact sets.
+
+    A short search from equal pulls along all pairs of contacts finds them (`forces_near`). So they
+    need little friction at three contacts, and are a rough guess for more. The strongest finger has
+    a normal force of 1 N. They are in the frame of the `contacts`, and NaN if the search finds no
+    forces that push at every contact.
+    """
+    points = contacts.points
+    pairs = contact_pairs(points.shape[1], points.device).shape[1]
+    forces = forces_near(points, contacts.normals, points.new_ones(len(points), pairs))
+    push = -dot(forces, contacts.normals)
+    return forces / push.amax(1)[:, None, None]
+
+
+def squeezing_strength(
+    hand: Hand,
+    held: Grasps | IKSeeds,
+    contacts: Contacts,
+    forces: Float[Tensor, "g f 3"],
+    most: float,
+) -> Float[Tensor, "g"]:
+    """Return how hard [N] each posture of the hand can squeeze its object, at most `most` [N].
+
+    It is the normal force of the strongest finger at which a drive reaches its greatest torque.
+    `held` gives the postures of the hand in g grasps. `contacts` are their contacts, one for each
+    of the f fingers. `forces` (g, f, 3) [N] are the `squeezing_forces` there. The strength is 0
+    where the forces are NaN.
+    """
+    greatest = _most_times(hand, held, contacts, forces)
+    return greatest.nan_to_num(0.0).clamp(max=most)
+
+
+def _most_times(
+    hand: Hand, held: Grasps | IKSeeds, contacts: Contacts, forces: Float[Tensor, "g f 3"]
+) -> Float[Tensor, "g"]:
+    """Return the largest factor on the `forces` [N] at the contacts of each posture at which no
+    drive exceeds its greatest torque.
+    """
+    jacobian, pushes, effort = _levers(hand, held, contacts, forces)
     torque = torch.einsum("gfih,gfi->gh", jacobian, pushes)
     return (effort / torque.abs()).amin(1)
 
