@@ -29,10 +29,13 @@ SIXES = {
 def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[str, Any]:
     """Return the coordinates and normals in a table whose columns have names, as a dictionary.
 
-    `points` (n, 3) are the columns x, y and z. `normals` (n, 3) are nx, ny and nz, or None. `other`
-    lists the names of the other columns. Capitals, and names such as normal_x, are understood. Each
-    of the `columns` is an array (n,) or (n, k); of k numbers a line, the first counts. `names` are
-    their names. Raises `Malformed` for a missing or double column.
+    Its key `points` has the columns x, y and z as an array (n, 3). `normals` has nx, ny and nz, or
+    None if the table has no normals. `other` lists the names of the other columns. Capitals, and
+    names such as normal_x, are understood.
+
+    Each of the `columns` is an array (n,) or (n, k), with one entry for each of the n lines. Of k
+    numbers in a line, only the first is used. `names` are the names of the columns. Raises
+    `Malformed` for a missing column, or for two of one name.
     """
     places = dict[str, int]()
     other = list[str]()
@@ -63,17 +66,19 @@ def read_fields(
 ) -> list[np.ndarray]:
     """Return an array (count, n) for each field of a table with `count` lines, one for each point.
 
-    Little memory beyond the numbers is used.
+    Little memory is used beyond the arrays themselves.
 
     Args:
         data: the table, as text or in binary form.
-        fields: for each field the NumPy type code of a number, and the number n of its values.
+        fields: for each field the NumPy type code of its numbers, such as "f4", and their number n
+            in a line.
         count: number of lines.
         order: byte order of binary data, "<" or ">"; "" means that the data are text.
         last: whether the table ends the data; otherwise anything may follow it.
 
-    Raises `Malformed` for too little data. With `last`, it is also raised for data of a further
-    line, or a wrong number of values in the first.
+    Raises `Malformed` for too little data, for a word that is no number, or for a `count` above 5
+    million (`CLOUD_POINTS`). With `last`, it is also raised for data of a further line, or a wrong
+    number of values in the first.
     """
     if not 0 <= count <= CLOUD_POINTS:
         raise Malformed(f"{count} points, not up to {CLOUD_POINTS}")
@@ -126,13 +131,15 @@ def _count_words(data: bytes) -> int:
 
 
 def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
-    """Return the points, and normals if any, in the columns of a text. The names in its first line
-    say which column is which (`find_columns`).
+    """Return the points, and normals if any, in the n lines of a text, as a dictionary.
 
-    `data` is the content of the file. Without names there must be three or six columns, and the
-    dictionary holds one array `columns` (n, 3) or (n, 6). A first line of one number counts the
-    lines. In files with the `suffix` .xyzi or .pts an intensity may follow x, y and z, and then a
-    colour. In .xyzrgb a colour follows. Raises `Malformed` for other texts.
+    If a first line names the columns, the keys are `points` (n, 3), `normals` (n, 3) or None, and
+    `other`, names of other columns. Without names there must be three or six columns. The only key
+    is then `columns`, an array (n, 3) or (n, 6). A first line of one number counts the lines.
+
+    `data` is the content of the file. In files with the `suffix` .xyzi or .pts an intensity may
+    follow x, y and z, and then a colour. In .xyzrgb a colour follows. Raises `Malformed` for a text
+    that is no such table.
     """
     names, table = _read_text(data)
     rows, width = table.shape
@@ -157,8 +164,9 @@ def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
 def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
     """Return the numbers of a text as an array with one row for each line.
 
-    Blanks, commas or semicolons separate the numbers. `#` or `//` starts a comment. A first line of
-    words is left out. Raises `Malformed` for other texts.
+    `data` is the content of the file. Blanks, commas or semicolons separate the numbers. `#` or
+    `//` starts a comment. A first line of words is left out. Raises `Malformed` for a text that is
+    no such table of numbers.
     """
     return _read_text(data)[1]
 

@@ -41,8 +41,9 @@ class Field(NamedTuple):
     """A value in a JSON or TOML file, with the file's path and the field's name.
 
     `path` is the file. `place` names the field, such as `objects.cup`, "" for the whole file.
-    `refuse(found, allowed)` makes the error for a bad value. It is the error that all methods raise
-    for a value that they do not accept.
+    `value` is what the parser read. `refuse(found, allowed)` makes the error for a bad value, from
+    sentences on what was found and what is allowed. It is the error that all methods raise for a
+    value that they do not accept.
     """
 
     path: Path
@@ -51,8 +52,8 @@ class Field(NamedTuple):
     refuse: Refuse
 
     def wrong(self, allowed: str) -> BadArgument:
-        """Return the error for a bad value of this field, made by `refuse`. `allowed` says what is
-        expected.
+        """Return the error for a bad value of this field, made by `refuse`. `allowed` says which
+        values are allowed, such as "a list". The error is not raised here.
         """
         try:
             text = repr(self.value)[: SHOWN_LETTERS + 1]
@@ -78,8 +79,8 @@ class Field(NamedTuple):
         }
 
     def items(self, most: int = 1000) -> "list[Field]":
-        """Return the items of a list as fields. Raises the error that `refuse` makes for another
-        value, or for more than `most` items.
+        """Return the items of a list as fields. Raises the error that `refuse` makes if the value
+        is no list, or has more than `most` items.
         """
         if not isinstance(self.value, list) or len(self.value) > most:
             raise self.wrong(f"a list of at most {most}")
@@ -88,8 +89,8 @@ class Field(NamedTuple):
         ]
 
     def text(self, most: int = JSON_LETTERS) -> str:
-        """Return the value as a text of at most `most` letters. Raises the error that `refuse`
-        makes for another value.
+        """Return the value as a text of at most `most` letters, by default 200 (`JSON_LETTERS`).
+        Raises the error that `refuse` makes for a value that is no such text.
         """
         if not isinstance(self.value, str) or len(self.value) > most:
             raise self.wrong(f"a text of at most {most} letters")
@@ -97,7 +98,7 @@ class Field(NamedTuple):
 
     def number(self, low: float = -sys.float_info.max, high: float = sys.float_info.max) -> float:
         """Return the value as a number in [low, high], by default any finite number. Raises the
-        error that `refuse` makes for another value.
+        error that `refuse` makes for a value that is no such number, such as true or false.
         """
         number = self.value
         if (
@@ -115,8 +116,8 @@ class Field(NamedTuple):
     def numbers(
         self, count: int, low: float = -sys.float_info.max, high: float = sys.float_info.max
     ) -> list[float]:
-        """Return the value as a list of `count` numbers in [low, high]. Raises the error that
-        `refuse` makes for another value.
+        """Return the value as a list of `count` numbers in [low, high], by default any finite ones.
+        Raises the error that `refuse` makes for a value that is no such list.
         """
         if not isinstance(self.value, list) or len(self.value) != count:
             raise self.wrong(f"{count} numbers")
@@ -124,7 +125,7 @@ class Field(NamedTuple):
 
     def whole(self, low: int, high: int) -> int:
         """Return the value as a whole number in [low, high]. Raises the error that `refuse` makes
-        for another value.
+        for a value that is no such number, such as 1.0 or true.
         """
         if (
             isinstance(self.value, bool)
@@ -138,8 +139,9 @@ class Field(NamedTuple):
 def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) -> Field:
     """Return the content of a JSON file as a field.
 
-    The file is in UTF-8, has at most `most` bytes, and no NaN or infinity. For another file the
-    error `refuse(found, allowed)` is raised; `allowed` says what is expected.
+    The file must be in UTF-8, with at most `most` bytes, by default 32 MiB (`JSON_BYTES`), and no
+    NaN or infinity. For another file the error `refuse(found, allowed)` is raised, and later for
+    each bad value of the field. `allowed` says what is expected.
     """
     data = read_bounded(path, most, allowed, refuse)
     try:
@@ -158,7 +160,7 @@ def save_tensors(
     path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]
 ) -> Path:
     """Write tensors and metadata (`meta`) by name to a safetensors file, and return its path.
-    `kind` is a word, such as "grasps", that the file's metadata get.
+    `kind`, a word for the content such as "grasps", is added to the metadata of the file.
 
     Raises `OutputError` if the file cannot be written.
     """
@@ -190,8 +192,8 @@ def load_tensors(
 
     `kind` is the word for its content, such as "grasps", that the file's metadata must hold. The
     file must hold the tensors `names`, and may hold those in `optional`. Raises `ModelFileError`
-    for a missing or broken file, another kind or version, and other tensors. Raises it also for
-    numbers that are not finite, or greater than 1e30 in size.
+    for a missing or broken file, and for another kind or version of the layout. Raises it also for
+    missing or further tensors, and for numbers that are not finite, or greater than 1e30 in size.
     """
     allowed = names.union(optional)
     refuse = functools.partial(ModelFileError, "path")
@@ -228,9 +230,12 @@ def read_value(
 
     `kind` is the word for its content, such as "grasps", that the file's metadata must hold. The
     tensors of the file have the names of the fields of class `of`. `rest` gives the fields that are
-    no tensors; those left out keep their defaults. Raises `ModelFileError` for a missing or broken
-    file, another kind or version, and wrong tensors or numbers (`load_tensors`). It is also raised
-    for a tensor whose shape or dtype is not that of the field's annotation.
+    no tensors; those left out keep their defaults.
+
+    Raises `ModelFileError` for a missing or broken file, and for another kind or version of the
+    layout. Raises it also for missing or further tensors, and for numbers that are not finite, or
+    greater than 1e30 in size. It is also raised for a tensor whose shape or dtype is not that of
+    the field's annotation.
     """
     fields = _tensor_fields(of)
     optional = {name for name, kinds in fields.items() if type(None) in kinds}
@@ -287,10 +292,10 @@ def _is_value(hint: Any) -> bool:
 
 
 class Recent(Generic[Item]):
-    """A cache of the items that were read last, each under an integer that identifies it.
+    """A cache of the items that were used last, each under an integer that identifies it.
 
-    `most` is the number of items kept, and `kept` holds them. A copy in another process starts
-    empty.
+    `most` is the greatest number of items kept, and `kept` holds them by their integers. A copy in
+    another process starts empty.
     """
 
     def __init__(self, most: int) -> None:

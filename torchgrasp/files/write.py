@@ -29,7 +29,7 @@ LOCK = ".lock"  # name of the lock file in a folder. It holds the process and ho
 
 
 def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], object]) -> Path:
-    """Write a file atomically, and return its path.
+    """Write a file atomically, so that it is complete or unchanged, and return its path.
 
     `content` is text (written as UTF-8), bytes, or a function that writes bytes to the file object
     that it is given. A missing folder is created. Raises `OutputError` if the folder cannot be
@@ -91,7 +91,9 @@ def explain(error: Exception) -> str:
 
 
 def is_file(path: Path | str) -> bool:
-    """Return whether a path is a regular file; False for a path of a wrong type or length."""
+    """Return whether a path is a regular file. False also if it is no path at all, such as None, or
+    too long for the system.
+    """
     try:
         return Path(path).is_file()
     except (OSError, TypeError, ValueError):
@@ -109,8 +111,8 @@ def read_bytes(path: Path | str) -> bytes:
 def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> bytes:
     """Return the content of a regular file of at most `most` bytes.
 
-    For a larger file, anything else, or a pointer of Git LFS, the error `refuse(found, allowed)` is
-    raised. `allowed` says what is expected.
+    The error `refuse(found, allowed)` is raised for a larger file, a missing one, a folder or
+    device, or a pointer of Git LFS. `allowed` says what is expected.
     """
     check_file(path, most, allowed, refuse)
     try:
@@ -139,7 +141,9 @@ def sha256(path: Path | str) -> str:
 
 
 def format_json(value: Any) -> str:
-    """Return a value as JSON text; a status is written as its name, NaN and infinity as null."""
+    """Return a value as JSON text; a member of the enum `Status` is written as its name, NaN and
+    infinity as null.
+    """
     return json.dumps(_plain(value), indent=1)
 
 
@@ -159,7 +163,8 @@ def render(
 ) -> str:
     """Return the text of a Jinja template whose variables have the given `values`.
 
-    `filters` are further filters of Jinja by name. Texts that are put into HTML or XML are escaped.
+    `template` is the path of the template's file. `filters` are further filters of Jinja by name;
+    None means none. Texts that are put into HTML or XML are escaped.
     """
     engine = template_engine(template.parent)
     engine.filters |= filters or {}
@@ -168,7 +173,10 @@ def render(
 
 @functools.cache
 def template_engine(folder: Path) -> "jinja2.Environment":
-    """Return the Jinja environment that loads templates from a folder."""
+    """Return the Jinja environment that loads templates from a folder, the same one at each call.
+
+    It escapes values in templates whose names end in .html, .js, .css or .xml.jinja.
+    """
     loader = jinja2.FileSystemLoader(folder)
     escape = jinja2.select_autoescape(("html", "js", "css", "xml.jinja"))
     return jinja2.Environment(
@@ -181,7 +189,7 @@ def template_engine(folder: Path) -> "jinja2.Environment":
 
 
 def format_columns(rows: Sequence[Sequence[str]], left: Collection[int] = ()) -> str:
-    """Return rows of cells as aligned lines of text, one for each row.
+    """Return a table of text cells as lines of aligned columns, one line for each of the `rows`.
 
     Columns are right-aligned; those with an index in `left` are left-aligned.
     """
@@ -193,7 +201,8 @@ def format_columns(rows: Sequence[Sequence[str]], left: Collection[int] = ()) ->
 def format_line(cells: Sequence[object], widths: Sequence[int]) -> str:
     """Return cells as one line of text, each as wide as `widths` says in characters.
 
-    A cell of negative width is left-aligned, one of positive width right-aligned.
+    A cell of negative width is left-aligned, one of positive width right-aligned. Two blanks
+    separate the cells.
     """
     columns = zip(cells, widths, strict=True)
     return "  ".join(f"{cell!s:{'<' if w < 0 else '>'}{abs(w)}}" for cell, w in columns).rstrip()
@@ -201,9 +210,10 @@ def format_line(cells: Sequence[object], widths: Sequence[int]) -> str:
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Create and lock a folder within the context, and remove half-written files in it.
+    """Create a folder, lock it until the context ends, and remove half-written files in it.
 
-    Raises `OutputError` for a folder that another run has locked, or that cannot be written.
+    A folder that was created here is removed again if it is empty at the end. Raises `OutputError`
+    for a folder that another run has locked, or that cannot be written.
     """
     with _hold("folder", folder, folder / LOCK):
         _remove_parts(folder.rglob(f".*{ENDING}"))
@@ -212,7 +222,7 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def hold_file(path: Path) -> Iterator[None]:
-    """Lock a file within the context, by a lock file beside it.
+    """Lock a file until the context ends, by a lock file beside it. The file need not exist.
 
     Half-written copies of the file, which an interrupted run left, are removed. Raises
     `OutputError` for a file that another run has locked, or that cannot be written.
@@ -225,10 +235,10 @@ def hold_file(path: Path) -> Iterator[None]:
 
 
 def begin_folder(path: Path, content: str, what: str) -> None:
-    """Write the file `path` with a text `content` that describes its folder.
+    """Write the text `content` to the file `path`, to record what the folder of this file is for.
 
     Nothing is written if the file has this content already. Raises `OutputError` if the file has
-    another content, or if the folder holds other files but not this one. `what` is a word for the
+    another content, or if its folder holds other files but not this one. `what` is a word for the
     folder's content in errors, such as "campaigns".
     """
     check_begun(path)
@@ -245,7 +255,7 @@ def begin_folder(path: Path, content: str, what: str) -> None:
 def check_begun(path: Path) -> None:
     """Raise `OutputError` if the folder of the file `path` holds other files, but not this one.
 
-    Lock files and half-written files do not count.
+    Its lock file (.lock) and half-written files do not count.
     """
     folder = path.parent
     if not path.exists() and {*folder.glob("*")} - {folder / LOCK, *folder.glob(f".*{ENDING}")}:
