@@ -79,7 +79,7 @@ class DraftNumbers:
     least_free: float = 0.02
     # two links of one finger collide often if they do in this share of the postures or more
     most_within: float = 0.25
-    # the same for two other links
+    # two links of different fingers collide often if they do in this share of the postures or more
     most_between: float = 0.5
     listed: int = 5  # greatest number of pairs of links that a warning names
     thin: float = 6e-3  # thickness [m] of a link below which it may be no fingertip
@@ -442,7 +442,8 @@ def _hangs_on(urdf: Urdf, link: str, other: str) -> bool:
 def clean_arm(path: Path | str, meshes: Path | str | None = None) -> str:
     """Return the text of an arm's URDF with boxes and cylinders in place of collision meshes.
 
-    `load_arm` needs such a URDF. A revolute joint without limits gets [-pi, pi] rad.
+    `load_arm` reads only URDFs without meshes. A revolute joint without limits gets [-pi, pi] rad.
+    A joint without a limit of effort or velocity gets one that is typical of small hands.
 
     Args:
         path: the published URDF of the arm.
@@ -472,8 +473,8 @@ def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4
 class FingerSet(NamedTuple):
     """A set of fingers that grasp, and the positions of the joints that stay fixed meanwhile.
 
-    `tips` are the names of the fingertip links. `parked` holds the positions [rad or m], by name of
-    the joint.
+    `tips` are the names of the fingertip links that grasp. `parked` holds the position [rad or m]
+    of each fixed joint, by the joint's name.
     """
 
     tips: list[str]
@@ -620,7 +621,7 @@ def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
     """Return the names of the fingertip links of a URDF.
 
-    These are the last links with a collision shape on the branches that joints move.
+    Each is the last link with a collision shape on a branch, if a joint moves this link.
     """
     parents = {j.parent for j in urdf.joints}
     shaped = {x.name for x in urdf.links if x.shapes}

@@ -71,8 +71,8 @@ Corners = tuple[np.ndarray, np.ndarray]  # lower and upper corner (3,) of a box 
 def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
     """Return the path of the file of a mesh that a URDF names, also by `package://`.
 
-    `name` is the mesh in the URDF. The file must lie inside `folder`. Raises `HandFileError`, which
-    gives the reason, for a mesh that is missing, outside, too large or in another format.
+    `name` is the path as the URDF has it. The file must lie inside `folder`. Raises `HandFileError`
+    for a file that is missing, outside, larger than 50 MiB (`MESH_BYTES`) or in another format.
     """
     base = folder.resolve()
     here = urdf.path.resolve().parent
@@ -120,8 +120,10 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
 def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
     """Return points (n, 3) [m] on each collision shape of every link, by the name of the link.
 
-    They are in the link's frame, one array for each shape. The meshes lie inside `folder`. Raises
-    `HandFileError` for meshes that are too large, or in a wrong unit.
+    They are in the link's frame, one array for each shape. The mesh files lie inside `folder`.
+    Raises `HandFileError` for mesh files that are missing, malformed, or larger than 200 MiB in all
+    (`HAND_MESH_BYTES`). Raises it also for a mesh in a wrong unit: one with a coordinate beyond 2 m
+    (`MAX_EXTENT`), or none of 0.5 mm.
     """
     names = {shape.file for link in urdf.links for shape in link.shapes if shape.kind == "mesh"}
     size = sum(mesh_file(urdf, name, folder).stat().st_size for name in names)
@@ -156,11 +158,12 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
 
 
 def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tuple[Urdf, list[str]]:
-    """Return the URDF with a few boxes or a cylinder instead of every mesh, and a sentence on it.
+    """Return the URDF with a few boxes or a cylinder instead of every collision mesh, and a
+    sentence on it.
 
-    `points`, from `shape_points`, holds by link an array (n, 3) [m] for each of its shapes. They
-    are in the link's frame. The sentence holds the counts; it is the only one in a list, which is
-    empty without meshes.
+    `points`, from `shape_points`, holds by link an array (n, 3) [m] of points on each shape. They
+    are in the link's frame. The sentence says how many shapes replace how many meshes. It is the
+    only one in a list, which is empty without meshes.
     """
     links = []
     count = 0
@@ -184,8 +187,10 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
 def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
     """Return the URDF with a ball at the end of the link `tip` instead of its shapes.
 
-    A long tip also gets boxes up to the ball. `ball` is the pad, and the unit vector `outward`
-    points to the end of the finger. `points` (n, 3) [m] lie on the tip. All are in its frame.
+    A tip longer than 2.6 radii of the ball (`FIT.long_tip`) also gets boxes up to the ball. `ball`
+    is the tip's pad, the sphere that touches objects; its radius is not 0. The unit vector
+    `outward` (3,) points to the end of the finger. `points` (n, 3) [m] lie on the surface of the
+    tip. All are in the frame of the link.
     """
     link = next(x for x in urdf.links if x.name == tip)
     reach = (points - np.array(ball.center)) @ outward
@@ -201,10 +206,12 @@ def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Point
 
 
 def read_mesh_file(urdf: Urdf, name: str, folder: Path) -> "trimesh.Trimesh":
-    """Return the mesh [m] of a file that a URDF names, read without any file that it refers to.
+    """Return the mesh [m] of a file that a URDF names, before the scale that the URDF gives it.
 
-    The file lies inside `folder`. Raises `HandFileError` for a file that is missing, outside, too
-    large, malformed or without faces. Raises `MissingExtra` for a .dae without pycollada.
+    `name` is the path as the URDF has it. Other files that the mesh file refers to are not read.
+    Raises `HandFileError` for a file that is missing, outside `folder`, malformed or without faces.
+    Raises it also for more than 50 MiB (`MESH_BYTES`) or 500,000 faces (`MESH_FACES`). Raises
+    `MissingExtra` for a .dae if pycollada is not installed.
     """
     path = mesh_file(urdf, name, folder)
     data = read_bounded(path, MESH_BYTES, "a mesh", functools.partial(HandFileError, "urdf"))
@@ -247,9 +254,11 @@ def _sample(mesh: "trimesh.Trimesh") -> Points:
 
 
 def fit_shapes(points: Points) -> list[LinkShape]:
-    """Return a few boxes, or a cylinder, that cover the points (n, 3) [m] on a body.
+    """Return collision shapes that cover the points (n, 3) [m] on a body: up to eight boxes, or one
+    cylinder.
 
-    The shapes are in the frame of the points.
+    The cylinder is taken if it has less than 0.9 of the boxes' volume (`FIT.round_share`). The
+    shapes are in the frame of the points.
     """
     turn = _axes(points)
     local = points @ turn
@@ -327,11 +336,11 @@ def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[flo
 def turned_shape(
     kind: str, size: tuple[float, ...], turn: np.ndarray, center: np.ndarray
 ) -> LinkShape:
-    """Return a collision shape with rounded numbers.
+    """Return a collision shape of a link from its axes and its middle, with rounded numbers.
 
     `kind` is "box", "cylinder" or "sphere". `size` [m] is the three sides, (radius, length), or
-    (radius,). `turn` (3, 3) holds its axes as columns; a cylinder lies along the third. `center`
-    (3,) [m] is its middle. Both are in the frame of its link.
+    (radius,). `turn` (3, 3) holds the axes of the shape as columns; a cylinder lies along the
+    third. `center` (3,) [m] is the middle of the shape. Both are in the link's frame.
     """
     pose = np.eye(4)
     pose[:3, :3] = turn

@@ -25,7 +25,8 @@ class FromMjcf(NamedTuple):
 
     Attributes:
         urdf: the URDF.
-        tips: names of the links with a site at a fingertip; () if these are not three to five.
+        tips: names of the links with a site whose name contains "tip"; () if these are not three to
+            five.
         told: sentences for the user on how the URDF was made, such as bodies that are left out.
         warnings: sentences for the user on what the URDF lacks and the hand may need. These are
             limits on sums of joints, and tendons without a motor.
@@ -45,13 +46,14 @@ def read_mjcf(
     visual: bool,
     meshes: Path | None,
 ) -> FromMjcf:
-    """Return an MJCF as a URDF, whose meshes are written to `folder`.
+    """Return an MJCF, a model file of MuJoCo, as a URDF, whose meshes are written to `folder`.
 
-    All files of the MJCF lie below the folder `meshes`; None means its own. `root` names a body of
-    the hand, if the file has several hands; "" if not. `tips` are names of sites or bodies that the
-    user chose as fingertips. With `visual`, bodies without collision geoms take their visual ones.
-    Raises `HandFileError` for a file that is malformed, too large, or more than a URDF can say.
-    Raises `MissingExtra` without MuJoCo.
+    All files of the MJCF lie below the folder `meshes`; None means the folder of the MJCF. `root`
+    names a body of the hand, if the file has several hands; "" if not. `tips` are names of sites or
+    bodies that the user chose as fingertips. With `visual`, bodies without collision geoms take
+    their visual ones. Raises `HandFileError` for a file that is malformed or too large, and for ball
+    joints and other parts without a counterpart in a URDF. Raises `BadArgument` for an unknown `root`, and
+    `MissingExtra` if MuJoCo is not installed.
     """
     mujoco = import_mujoco()
     safe = read_mjcf_text(path, meshes)

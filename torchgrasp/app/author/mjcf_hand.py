@@ -23,7 +23,7 @@ TIP = "tip"  # in the name of a site at a fingertip
 class Drive:
     """Limits `lower` and `upper` [rad or m] and greatest `effort` [N m or N] of a joint.
 
-    The effort is 0 if the file has none.
+    Limits that the file lacks are infinite, and an effort that it lacks is 0.
     """
 
     lower: float
@@ -76,12 +76,13 @@ class ModelHand:
         return HandFileError("mjcf", f"{self.path}: {found}", allowed)
 
     def choose(self, root: str) -> None:
-        """Choose the bodies of the hand, and the joints between them.
+        """Choose the bodies of the hand and the joints between them, and set the attributes.
 
-        They hang on the bodies fixed to the world that carry the joints with an actuator. If one
-        body carries these joints, it is the root of the hand, unless a joint moves it. Otherwise
-        the world is the root, with its bodies that stand still as the palm. `root` names a body of
-        the hand if the model has several hands; "" if not.
+        A base is a direct child of the world body that is, or carries, a body with a driven joint.
+        If one of them carries three fingers or more, the others are left out. A single base is the
+        root of the hand, unless a hinge or slide joint moves it. Otherwise the world is the root,
+        and with several bases its bodies that stand still are the palm. `root` names a body of the
+        hand if the model has several hands; "" if not.
 
         Raises `HandFileError` for several hands without a `root`, for a hand without an actuator,
         and for ball joints. Raises `BadArgument` for an unknown `root`.
@@ -205,7 +206,8 @@ class ModelHand:
     def couple(self) -> Mechanism:
         """Return which joints of the hand lead, which follow others, and which stand still.
 
-        Actuators may drive joints and fixed tendons; linear equalities may tie them to each other.
+        A motor sets a leading joint; others follow by linear coupling. Actuators may drive joints
+        and fixed tendons; linear equalities may tie them to each other.
         Raises `HandFileError` for other elements that move the hand, such as spatial tendons or a
         closed loop of bodies. Raises it also for equalities that contradict each other.
         """
@@ -352,9 +354,10 @@ class ModelHand:
         self.told.append(f"equality {name} to a body beside the hand is left out")
 
     def drives(self, mechanism: Mechanism) -> dict[int, Drive]:
-        """Return limits and effort of every joint of the hand, by its index in the model.
+        """Return limits and effort of every joint of the hand, by the joint's index in the model.
 
-        `mechanism`, from `couple`, says which joints lead and how the others follow.
+        Limits of controls and of tendons narrow those of the joints. `mechanism`, from `couple`,
+        says which joints lead and how the others follow.
         """
         pulls = self._pulls()
         model = self.model
@@ -564,7 +567,7 @@ def names_of(model: Any, kind: str, count: int) -> list[str]:
 
 
 def unused_name(name: str, taken: set[str]) -> str:
-    """Return a name that is not in `taken`, and add it there.
+    """Return a name that is not in the set `taken`, and add it to this set.
 
     It is `name`, with as many underscores behind it as are needed.
     """

@@ -55,10 +55,11 @@ refuse = functools.partial(HandFileError, "mjcf")  # the error of this gate, as 
 
 
 class SafeMjcf(NamedTuple):
-    """The checked content of an MJCF, a model file of MuJoCo: the name of the model, and the text.
+    """The checked content of an MJCF, a model file of MuJoCo.
 
-    `meshes` holds the bytes of each mesh file, by its name in the text. `left_out` holds the tags
-    of elements that were taken out although they bear on a hand's motion or touch.
+    `name` is the name of the model, and `text` the XML with all included files. `meshes` holds the
+    bytes of each mesh file, by its name in the text. Of the elements that were taken out,
+    `left_out` holds the tags that matter for motion or contact, such as "flexcomp".
     """
 
     name: str
@@ -91,9 +92,9 @@ def read_mjcf_text(path: Path, base: Path | None = None) -> SafeMjcf:
 
     All files must lie below the folder `base`; None means the folder of the MJCF.
 
-    Raises `HandFileError` for files that are missing, outside, malformed or too large. Raises it
-    also for <replicate> and <composite>, which make many bodies. The same is raised for <attach>
-    and <model>, which read other models.
+    Raises `HandFileError` for files that are missing, outside this folder, malformed or too large.
+    Raises it also for <replicate> and <composite>, which make many bodies. The same is raised for
+    <attach> and <model>, which read other models.
     """
     left = Counter[str]()
     spot = _Spot(path, (base or path.parent).resolve())

@@ -17,7 +17,7 @@ FINENESS = 3  # subdivisions of an icosahedron that stands for an ellipsoid
 
 
 class UrdfWriter:
-    """Writes a hand of a compiled model as a URDF.
+    """Writes a hand of a compiled MuJoCo model as a URDF.
 
     Args:
         name: name of the robot.
@@ -51,7 +51,8 @@ class UrdfWriter:
     def write(self, tips: Sequence[str]) -> str:
         """Return the hand as the text of a URDF; write its meshes to the folder.
 
-        Sites of the hand become links if their names are among `tips` or contain "tip".
+        Sites of the hand become links if their names are among the `tips`, or contain "tip" or
+        "TIP".
         """
         for body in self.hand.bodies:
             self._add_body(body)

@@ -25,17 +25,19 @@ from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf, pose_of
 
 @dataclasses.dataclass(frozen=True)
 class PadNumbers:
-    """Numbers by which pads are guessed from the motion and the surface of tips."""
+    """Numbers by which pads, the parts that touch objects, are guessed from the motion and the
+    surface of fingertips.
+    """
 
     # share of the random postures in which fingers count as meeting: those with the nearest tips
     near_share: float = 0.1
-    # distance of the middle of the range of a joint from zero, as a share of the range, beyond
-    # which the joint bends to one side
+    # distance of the middle of a joint's range from zero, as a share of the range; beyond it the
+    # pad is on the side with most of the range
     one_sided: float = 0.1
     # angle [rad] by which the contact of a round tip is turned from its motion to the finger's end
     tilt: float = math.radians(30)
     short_arm: float = 1e-3  # least distance of a tip from the axis of a joint that moves it [m]
-    # greatest distance [m] of surface points that count as on a ray or a plane
+    # greatest distance [m] of a surface point from a ray or plane on which it counts
     beside: float = 0.003
     end: float = 0.015  # length of a finger's end, half of whose thickness is the ball's radius [m]
     radii: tuple[float, float] = (0.003, 0.013)  # least and greatest radius of a ball [m]
@@ -64,10 +66,10 @@ Points = Float[np.ndarray, "_ 3"]  # points [m], of any count in each use
 
 
 class Guess(NamedTuple):
-    """A guess of the fingertip pads of a hand.
+    """A guess of the fingertip pads of a hand, the parts of the fingertips that touch objects.
 
     Attributes:
-        pads: the pad of each fingertip, in the frame of its link.
+        pads: the pad of each fingertip, in the frame of the fingertip's link.
         outward: unit vector (3,) from the last joint to the tip of each finger, in the same frame.
         approach: unit direction (3,) out of the palm, in the frame of the URDF's root.
     """
@@ -85,8 +87,9 @@ def guess_pads(
 ) -> Guess:
     """Return guessed pads of the fingertips, and the direction out of the palm.
 
-    `frames` (3, 4, l, n) are poses [m] in n random postures, in the frame of the URDF's root. They
-    are of the l links `tips` and, last, of the palm. `surfaces` holds points (k, 3) [m] on each
+    A pad is the part of a fingertip that touches objects. `frames` (3, 4, l, n) are poses [m] of l
+    links in n random postures. They are in the frame of the URDF's root. The links are the
+    fingertips, which `tips` names, and last the palm. `surfaces` holds points (k, 3) [m] on each
     link, by its name, in its frame.
     """
     links = {x.name: i for i, x in enumerate(urdf.links)}
@@ -133,11 +136,15 @@ def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
 
 
 def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
-    """Return the indices of the f tips in grasp order.
+    """Return the indices of f fingertips, those first whose pads best face each other.
 
-    First come the three whose pads face each other in the largest share of postures. Each further
-    tip is that with which this share stays largest. `frames` are poses (3 x 4) [m] of the tips in n
-    random postures. They are in the frame of the URDF's root. `pads` are in the frames of the tips.
+    First come the three whose pads face each other in the largest share of n random postures. Each
+    further tip is that with which this share stays largest. Pads face each other if all normals
+    point to the centroid of the contacts within 45 degrees (`FACING`). The contacts must be 15 to
+    80 mm from this centroid.
+
+    `frames` are poses (3 x 4) [m] of the tips, in the frame of the URDF's root. `pads` are in the
+    frames of the tips.
     """
     contacts = torch.tensor([pad.contact for pad in pads], dtype=torch.float64)
     normals = torch.tensor([pad.normal for pad in pads], dtype=torch.float64)

@@ -38,8 +38,8 @@ class RepairNumbers:
     # density [kg/m3] of the bounding box of a body without mass: half of it is filled with 1000
     # kg/m3
     density: float = 500.0
-    # greatest distance of the mass centre, and greatest radius of gyration, in half diagonals of
-    # the bounding box
+    # greatest distance of a link's mass centre from the middle of its bounding box, and greatest
+    # radius of gyration, in half diagonals of this box
     far_out: float = 2.0
     rounding: float = 1e-6  # relative error of inertias, which URDFs write with few digits
     digits: int = 15  # number of decimals of an angle [rad], so that short numbers remain short
@@ -51,7 +51,10 @@ Step = tuple[Urdf, list[str]]  # the repaired URDF, and a report: a sentence for
 
 
 def place(pose: np.ndarray) -> tuple[Triple, Triple]:
-    """Return translation [m] and fixed-axis angles (roll, pitch, yaw) [rad] of a pose (4, 4)."""
+    """Return translation [m] and fixed-axis angles (roll, pitch, yaw) [rad] of a pose (4, 4).
+
+    A URDF writes the <origin> of a joint or shape in this way.
+    """
     # of the two triples that mean the same rotation, the smaller
     one = [float(angle) for angle in trimesh.transformations.euler_from_matrix(pose)]
     two = [math.copysign(math.pi, angle) - angle for angle in one]
@@ -65,9 +68,9 @@ def place(pose: np.ndarray) -> tuple[Triple, Triple]:
 def keep_below(urdf: Urdf, root: str) -> Step:
     """Return the URDF with only the link `root` and the links below it, and a sentence on it.
 
-    This cuts a hand off an arm. The list of sentences is empty if `root` is the first link already.
-    Raises `BadArgument` for an unknown root, and `HandFileError` for a joint that mimics one above
-    the root.
+    This cuts a hand off an arm. The sentence is the only one in a list, which is empty if `root` is
+    the first link already. Raises `BadArgument` for an unknown root, and `HandFileError` for a
+    joint that mimics one above the root.
     """
     names = {x.name for x in urdf.links}
     if root not in names:
@@ -90,9 +93,10 @@ def keep_below(urdf: Urdf, root: str) -> Step:
 def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
     """Return the URDF with massless links merged into the links to which they are fixed.
 
-    A massless link at the end of a branch is kept if it has shapes. The second result is a list of
-    one sentence on the merged links, or none. The third gives for each merged link the link that
-    took it over.
+    A link without shapes counts as massless up to 1e-5 kg (`REPAIRS.frame`). A massless link at the
+    end of a branch is kept if it has shapes. The second result is a list of one sentence on the
+    merged links, empty without any. The third gives, by the name of each merged link, the name of
+    the link that took it over.
     """
     taken: dict[str, str] = {}
     while True:
@@ -129,8 +133,8 @@ def merge_markers(
     A marker is a link smaller than 6 mm (`REPAIRS.marker`), too small to touch an object. Some
     hands have markers for calibration. Its mass is kept, and its shapes are left out. `surfaces`
     holds points (n, 3) [m] on each link, by its name, in its frame. The second result is a list of
-    one sentence on the markers, or none. The third gives for each of them the link that took it
-    over.
+    one sentence on the markers, empty without any. The third gives, by the name of each marker, the
+    name of the link that took it over.
     """
     taken: dict[str, str] = {}
     while marker := _marker(urdf, surfaces):
@@ -220,9 +224,10 @@ def _moved(link: Link, pose: np.ndarray) -> Link:
 def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
     """Return the URDF with the wrist joints fixed at their rest positions, and a sentence on it.
 
-    Wrist joints move all the links `tips`. More than three of them (`REPAIRS.most_wrist`) are an
-    arm, which is cut off. Rest positions are zero, or the limit nearest to zero. The list of
-    sentences is empty if there is no such joint.
+    Wrist joints move all the fingertip links, which `tips` names; with fewer than three tips none
+    is sought. More than three wrist joints (`REPAIRS.most_wrist`) are an arm, which is cut off.
+    Rest positions are zero, or the limit nearest to zero. The sentence is the only one in a list,
+    which is empty if there is no such joint.
     """
     movers = urdf.movers(tips[0]) if len(tips) > 2 else []
     common = [j for j in movers if all(j in urdf.movers(tip) for tip in tips)]
@@ -268,10 +273,11 @@ def _fixed(joint: Joint, value: float) -> Joint:
 def repair_joints(urdf: Urdf) -> Step:
     """Return the URDF with complete limits of all joints, and a sentence for each repair.
 
-    Missing limits of position, effort and velocity are added. A follower is a joint that mimics
-    another. One that follows a follower then follows an independent joint. Ranges of independent
-    joints are narrowed so that their followers keep their own limits. Raises `HandFileError` for a
-    sliding joint without limits, and for a follower that cannot keep its limits.
+    Missing limits of position, effort and velocity are added, typical of small hands. A follower is
+    a joint that mimics another. One that follows a follower then follows an independent joint.
+    Ranges of independent joints are narrowed so that their followers keep their own limits. Raises
+    `HandFileError` for a sliding joint without limits, and for a follower that cannot keep its
+    limits. Raises it also for a follower with a ratio of 0.
     """
     joints = {j.name: j for j in urdf.joints}
     done = (
@@ -408,7 +414,8 @@ def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
     repair.
 
     A link without mass gets that of water in half its bounding box. An inertia or mass centre is
-    impossible if no body of the link's size and mass has it. It becomes that of the bounding box.
+    impossible if no body of the link's size and mass has it. The inertia then becomes that of a
+    box of this mass and size. An impossible mass centre becomes the middle of the bounding box.
     `surfaces` holds points (n, 3) [m] on each link, by its name, in its frame.
     """
     links = []

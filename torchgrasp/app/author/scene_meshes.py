@@ -23,8 +23,10 @@ LOOKS = ("bind_material", "extra", "instance_camera", "instance_light")  # parts
 def clean_dae(data: bytes) -> tuple[bytes, float]:
     """Return the bytes of a COLLADA file (.dae) with its geometry alone, and its length unit [m].
 
-    Its axes stay as they are, as in ROS. Raises `Malformed` for a DOCTYPE or ENTITY, for skins, for
-    nodes that repeat others, and for too many corners. Raises `MissingExtra` without pycollada.
+    `data` holds the bytes of the file. Its up axis is ignored, as in ROS. Raises `Malformed` for a
+    DOCTYPE or ENTITY, for skins, and for <instance_node>, which repeats other nodes. Raises it also
+    for more than 6 million indices of corners (`MOST_INDICES`). Raises `MissingExtra` if pycollada
+    is not installed.
     """
     if importlib.util.find_spec("collada") is None:
         raise MissingExtra("pycollada", "meshes")
@@ -60,7 +62,8 @@ def check_glb(data: bytes) -> None:
     """Raise `Malformed` for a .glb file with skins, compressed geometry, or too many corners.
 
     `data` holds the bytes of the file. At most 6 million corners (`MOST_INDICES`) are allowed. A
-    mesh counts once for each node that uses it.
+    mesh counts once for each node that uses it. A file without the header of a .glb is refused,
+    too.
     """
     if not data.startswith(MAGIC):
         raise Malformed("no header of a .glb file")

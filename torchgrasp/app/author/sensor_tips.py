@@ -22,7 +22,7 @@ from torchgrasp.hand.urdf import LinkShape, Urdf
 
 @dataclasses.dataclass(frozen=True)
 class SensorNumbers:
-    """Bounds of a sensor tip."""
+    """Numbers of a sensor tip, a rounded end that a tactile sensor adds to a fingertip."""
 
     # greatest distance [m] by which a sensor reaches beyond the maker's tip
     most_offset: float = 0.1
@@ -39,15 +39,17 @@ def extend_pads(
     radii: Sequence[float],
     named: bool,
 ) -> tuple[Pad, ...]:
-    """Return the pads of fingertips with sensor tips; a finger of offset 0 keeps its pad.
+    """Return the pads of fingertips that tactile sensors extend; a finger of offset 0 keeps its
+    pad.
 
-    `guess` holds the pads of the links `tips`, and the directions along which they are offset.
-    `offsets` [m] are the lengths by which sensors extend the tips; without any, no pad changes.
-    `radii` [m] are those of the sensors' balls; without any, those of the guessed pads. Each has
-    one number for all tips or, if the user `named` the tips, one for each.
+    `guess` holds the guessed pads of the links `tips`, and the directions along which they are
+    offset. `offsets` [m] are the lengths by which sensors extend the tips; without any, no pad
+    changes. `radii` [m] are those of the sensors' balls; without any, those of the guessed pads.
+    Each has one number for all tips or, if the user `named` the tips, one for each.
 
-    Raises `BadArgument` for a wrong count of numbers, or a length or radius outside its bounds.
-    Raises it also for a flat pad without a radius.
+    Raises `BadArgument` for a wrong count of numbers. Raises it also for a length outside 0 to 0.1
+    m, or a radius outside 0.1 mm to 0.1 m. The same is raised for a flat pad without a radius, and
+    for radii without offsets.
     """
     if not offsets:
         if radii:
@@ -85,9 +87,11 @@ def extend_pads(
 
 
 class Sensor(NamedTuple):
-    """A sensor tip: its fingertip link, its moved pad, and its cylinder [m] in the link's frame.
+    """A sensor tip, a cylinder with a ball at its end that a sensor adds to a fingertip.
 
-    `way` (3,) is the unit vector along the cylinder, away from the maker's tip.
+    `tip` names the fingertip's link. `pad` is its pad, moved to the ball. `way` (3,) is the unit
+    vector along the cylinder, away from the maker's tip. Both are in the link's frame. `length` [m]
+    is that of the cylinder.
     """
 
     tip: str
@@ -119,7 +123,8 @@ def find_sensors(tips: Sequence[str], guess: Guess, pads: Sequence[Pad]) -> list
 
 
 def add_sensors(urdf: Urdf, sensors: Sequence[Sensor]) -> tuple[Urdf, list[str]]:
-    """Return the URDF with sensor tips, and a sentence on them.
+    """Return the URDF with the collision shapes of sensor tips added to the fingertips, and a
+    sentence on them.
 
     The sentence is the only one in a list, which is empty without sensors. Masses stay as they are.
     """

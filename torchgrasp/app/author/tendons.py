@@ -50,9 +50,10 @@ class Joints(NamedTuple):
 class Mechanism(NamedTuple):
     """How the joints of a hand move: every joint leads, follows or stands still.
 
-    Motors set the positions of the leading joints. `followers` holds, by name, how each following
-    joint depends on leading ones. `still` holds, by name, the positions [rad or m] of joints that
-    nothing moves. `told` has a sentence on each choice for the user.
+    Motors set the positions of the leading joints, which are all others than these two kinds.
+    `followers` holds, by name, how each following joint depends on leading ones. `still` holds, by
+    name, the positions [rad or m] of joints that nothing moves. `told` has sentences for the user
+    on under-actuated and on still joints.
     """
 
     followers: dict[str, Mimic]
@@ -61,7 +62,9 @@ class Mechanism(NamedTuple):
 
 
 class Contradiction(Exception):
-    """Equalities that no posture obeys; `joints` names the joints."""
+    """Raised for equalities between joint positions that no posture obeys; `joints` names the
+    joints.
+    """
 
     def __init__(self, joints: tuple[str, ...]) -> None:
         super().__init__(", ".join(joints))
@@ -74,11 +77,12 @@ def couple_joints(
     values: Float[np.ndarray, "m"],
     pulls: Float[np.ndarray, "k n"],
 ) -> Mechanism:
-    """Return which of n joints lead, and how the others follow.
+    """Return which of n joints lead, how the others follow, and which stand still.
 
     The positions q (n,) [rad or m] of the joints obey m equalities, `equal @ q = values`. Each of k
-    motors sets one sum over the joints, an entry of `pulls @ q`. Joints with a motor of their own
-    are the first choice to lead. Raises `Contradiction` for equalities that no posture obeys.
+    motors sets one weighted sum of the positions, an entry of `pulls @ q`. Joints with a motor of
+    their own are the first choice to lead. If several joints share a motor, their springs or
+    dampers decide how they move. Raises `Contradiction` for equalities that no posture obeys.
     """
     followers = dict[str, Mimic]()
     still = dict[str, float]()

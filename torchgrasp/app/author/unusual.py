@@ -45,12 +45,13 @@ USUAL = UsualNumbers()
 
 
 def find_unusual(urdf: Urdf, points: Mapping[str, Sequence[np.ndarray]]) -> list[str]:
-    """Return a warning for each kind of number in a URDF that is outside the range of usual hands.
+    """Return a warning for each kind of number in a URDF that is outside the range of real hands.
 
     The kinds are sizes, distances, masses, densities, and the joints' ranges, efforts and
-    velocities. `points` holds, by link, an array (n, 3) [m] of points on each of its shapes, in the
-    link's frame. Numbers that the URDF lacks are not judged. One more warning names joints with
-    narrower soft limits, which the library ignores.
+    velocities; their ranges are those of `UsualNumbers`. `points` holds, by link, an array (n, 3)
+    [m] of points on each of its shapes, in the link's frame. Numbers that the URDF lacks are not
+    judged. One more warning names joints whose <safety_controller> has narrower limits, which the
+    library ignores.
     """
     sizes = []
     dense = []

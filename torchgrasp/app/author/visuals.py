@@ -41,10 +41,10 @@ Triangles = tuple[Float[np.ndarray, "_ 3"], np.ndarray]  # corners [m], and face
 def link_meshes(path: Path, data: bytes, folder: Path) -> dict[str, Triangles]:
     """Return one mesh for the <visual> elements of each link, by the name of the link.
 
-    A mesh is its corners (v, 3) [m] in the link's frame, and its faces (t, 3). Where it has too
-    many faces, near corners are joined. A link is left out if one of its visuals is missing,
-    malformed or too large. `path` and `data` are the path and the bytes of the URDF; mesh files lie
-    inside `folder`.
+    A mesh is its corners (v, 3) [m] in the link's frame, and its faces (t, 3), indices of corners.
+    Where it has more than 2000 faces (`VISUAL.most_faces`), near corners are joined. A link is left
+    out if one of its visuals is missing, malformed or too large. `path` and `data` are the path and
+    the bytes of the URDF; mesh files lie inside `folder`.
     """
     found = {}
     size = 0
@@ -73,8 +73,9 @@ def keep_visuals(
     """Return the visual meshes of a published URDF for the links of its repaired copy `clean`, by
     link.
 
-    A mesh is its corners (v, 3) [m] in the frame of the link, and its faces (t, 3). Each of the
-    `mergers` gives, for every link that was merged, the link that took it over. They are in the
+    A mesh is its corners (v, 3) [m] in the link's frame, and its faces (t, 3), indices of
+    corners. A link of `clean` also gets the meshes of the links that were merged into it. Each of
+    the `mergers` gives, for every link that was merged, the link that took it over. They are in the
     order of merging. Links that stay have the same frames in both URDFs. Mesh files lie inside
     `folder`. A link with a missing or malformed visual is left out.
     """
@@ -108,8 +109,8 @@ def keep_visuals(
 def mesh_files(meshes: Mapping[str, Triangles]) -> dict[str, tuple[str, bytes]]:
     """Return for each link, by its name, the path and the bytes of a mesh file, binary STL.
 
-    `meshes` holds corners (v, 3) [m] and faces (t, 3) by link. The path is relative to the URDF.
-    Nothing is written.
+    `meshes` holds by link corners (v, 3) [m], in the link's frame, and faces (t, 3). The path is
+    relative to the folder of the URDF. Nothing is written.
     """
     files = {}
     for number, (link, (vertices, faces)) in enumerate(meshes.items()):
