@@ -224,7 +224,7 @@ def _parser(first: str) -> SubcommandApp:
 
 
 def format_help() -> str:
-    """Return the help text: all commands in chapters, each with its summary."""
+    """Return the help text of `torchgrasp`: all commands in chapters, each with its summary."""
     lines = ["torchgrasp: dexterous fingertip grasps from a partial point cloud", ""]
     for chapter, commands in CHAPTERS.items():
         lines.append(chapter)

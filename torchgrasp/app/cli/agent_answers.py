@@ -12,9 +12,10 @@ DIGITS = 6  # decimals of numbers in answers [m, rad]: micrometres
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Answer:
-    """Base of the answers of the tools for agents.
+    """Base of the answers of the tools that `torchgrasp mcp` offers to AI agents.
 
-    `picture` holds the bytes of a PNG, or None; it is sent beside the other fields, not as text.
+    `picture` holds the bytes of a PNG, or None for no picture. It is sent beside the other fields,
+    not as text.
     """
 
     notes: tuple[str, ...] = option((), "what was noticed, such as advice for a better cloud")
@@ -23,7 +24,9 @@ class Answer:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GraspRow:
-    """A grasp that passed all checks: pose [m] in the frame of the cloud, joints [rad] by name."""
+    """A grasp that passed all checks: pose [m] of the hand in the frame of the cloud, and joint
+    positions [rad] by name.
+    """
 
     rank: int = required("0 is the best")
     success: float | None = required(
@@ -57,7 +60,10 @@ class ThingRow:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LookRow:
-    """A camera from which a second view would help. Standard deviations are at the contacts."""
+    """A camera from which a second view would make the estimated surface more certain.
+
+    The standard deviations are those of the surface, as means over the contacts of the grasps.
+    """
 
     obj_from_camera_m: tuple[tuple[float, ...], ...] = required(
         "pose of the camera in the frame of the grasps, 4 x 4: x right, y down, z forward"
@@ -120,7 +126,7 @@ class ExplainAnswer(Answer):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AdviceRow:
-    """A fault of a cloud and what mends it."""
+    """A fault of a point cloud and what mends it."""
 
     found: str = required("the fault")
     fix: str = required("what mends it")
@@ -129,7 +135,7 @@ class AdviceRow:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CloudAnswer(Answer):
-    """The measured quality of a cloud."""
+    """The measured quality of a point cloud, and advice for a better one."""
 
     usable: bool = required("whether grasps are planned on the cloud")
     advice: tuple[AdviceRow, ...] = required("faults of the cloud; refusals come first")

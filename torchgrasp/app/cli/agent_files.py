@@ -28,10 +28,10 @@ class Workplace:
         return cls(folder.resolve())
 
     def place(self, name: str, text: str) -> Path:
-        """Return the path below the folder that the relative path `text` names; it need not exist.
+        """Return the path below `root` for a path `text` relative to it; it need not exist.
 
-        Raises `BadArgument`, which calls the argument `name`, for a path out of the folder. Raises
-        it also for `..`, and for a symbolic link that leads out of the folder.
+        Raises `BadArgument`, which calls the argument `name`, for a path out of `root`. Raises it
+        also for `..`, and for a symbolic link that leads out of `root`.
         """
         check_path(name, text)
         path = self.root / text
@@ -45,7 +45,7 @@ class Workplace:
         return path
 
     def file(self, name: str, text: str) -> Path:
-        """Return the path of the file below the folder that the relative path `text` names.
+        """Return the path of an existing file below `root`, for a path `text` relative to it.
 
         Raises `BadArgument`, which calls the argument `name`, if there is no such file.
         """
@@ -55,18 +55,18 @@ class Workplace:
         return path
 
     def cloud(self, name: str, text: str) -> Path:
-        """Return the path of a cloud: of a file below the folder, or of a shipped object's view.
+        """Return the path of a point cloud: of a file below `root`, or of a shipped object's view.
 
-        `text` is a relative path, or the object's name. Raises `BadArgument`, which calls the
-        argument `name`, if there is no such file.
+        `text` is the path relative to `root`, or the object's name. Raises `BadArgument`, which
+        calls the argument `name`, if there is no such file.
         """
         return find_view(Path(text)) if text in list_objects() else self.file(name, text)
 
     def mesh(self, name: str, text: str) -> Path:
-        """Return the path of a mesh: of a file below the folder, or of a shipped object.
+        """Return the path of a mesh: of a file below `root`, or of a shipped object.
 
-        `text` is a relative path, or the object's name. Raises `BadArgument`, which calls the
-        argument `name`, if there is no such file.
+        `text` is the path relative to `root`, or the object's name. Raises `BadArgument`, which
+        calls the argument `name`, if there is no such file.
         """
         return DATA / text / "mesh.ply" if text in list_objects() else self.file(name, text)
 
@@ -93,5 +93,5 @@ class Workplace:
         return self.place("out", f"out/{object_name(source)}" if text is None else text)
 
     def tell(self, path: Path) -> str:
-        """Return a path below the folder as agents name it: relative to `root`, with slashes."""
+        """Return a path below `root` as text for an agent: relative to `root`, with slashes."""
         return path.relative_to(self.root).as_posix()

@@ -122,7 +122,9 @@ class AgentServer:
         )
 
     async def serve_stdio(self) -> None:
-        """Serve the agent that started this process, by stdin and stdout, until stdin ends."""
+        """Answer the calls of the agent that started this process, by stdin and stdout, until stdin
+        ends.
+        """
         stdio: Any = importlib.import_module("mcp.server.stdio")
         # What libraries print goes to stderr: the SDK moves the descriptor of stdout.
         async with stdio.stdio_server() as (reader, writer):
@@ -130,7 +132,9 @@ class AgentServer:
             await self.server.run(reader, writer, options)
 
     async def serve_http(self, port: socket.socket) -> None:
-        """Serve agents of this machine by HTTP on the bound socket `port`, until a signal."""
+        """Answer the calls of agents on this machine, by HTTP on the bound socket `port`, until a
+        signal such as SIGTERM.
+        """
         uvicorn: Any = importlib.import_module("uvicorn")
         security: Any = importlib.import_module("mcp.server.transport_security")
         number = port.getsockname()[1]
@@ -149,7 +153,7 @@ class AgentServer:
         await uvicorn.Server(config).serve(sockets=[port])
 
     async def list_tools(self, context: Any, params: Any) -> Any:
-        """Return all tools with the JSON schemas of their arguments and answers.
+        """Return all tools with the JSON schemas of their arguments and answers, in MCP's format.
 
         The package `mcp` calls it; `context` and `params` are not used.
         """
@@ -168,7 +172,7 @@ class AgentServer:
         return self.types.ListToolsResult(tools=listed)
 
     async def call_tool(self, context: Any, params: Any) -> Any:
-        """Run a tool, and return its answer, or its error as one sentence, in the form of MCP.
+        """Run a tool, and return its answer, or its error as one sentence, in MCP's format.
 
         The package `mcp` calls it. `params` holds the `name` of the tool and its `arguments`.
         `context` is the client's session.
@@ -192,9 +196,9 @@ class AgentServer:
     async def work(self, context: Any, tool: Tool) -> Answer:
         """Run a tool in another process, one tool at a time, and return its answer.
 
-        `context` is the client's session, to which progress is reported. Raises the `GraspError` of
-        the tool, and one if its process dies. Raises `BadArgument` after the longest time of a
-        call.
+        `context` is the client's session, to which progress is reported. Raises the `GraspError`
+        that the tool raises, and a `GraspError` if the process dies. Raises `BadArgument` for a
+        call that takes longer than the server's `seconds`.
         """
         outcome: Answer | GraspError | None = None
         async with self.turn, self.anyio.create_task_group() as group:
@@ -308,8 +312,8 @@ def say(told: GraspError | str) -> str:
     """Return an error or advice as one line, in which an option such as --depth-unit becomes
     depth_unit.
 
-    So it names the arguments of a tool. A line with a whole command line, as `torchgrasp grasp
-    jug`, keeps its options.
+    Agents know options by these names, the arguments of tools. A line with a whole command line,
+    as `torchgrasp grasp jug`, keeps its options.
     """
     line = one_line(told)
     if LIBRARY in line:
@@ -318,9 +322,10 @@ def say(told: GraspError | str) -> str:
 
 
 def make_schema(kind: Any) -> dict[str, Any]:
-    """Return the JSON schema of a type, as a dict.
+    """Return the JSON schema of a type annotation, as a dict.
 
-    Of a dataclass, it has the fields with a help text, each described by this text.
+    `kind` is a plain type such as float, a union, tuple, dict, Literal or Annotated, or a
+    dataclass. The schema of a dataclass has its fields with a help text, which describes each.
 
     >>> make_schema(tuple[float, float] | None)["anyOf"][0]["maxItems"]
     2

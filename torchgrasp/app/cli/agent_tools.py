@@ -143,10 +143,11 @@ MESH_HELP = "closed mesh [m] (.ply, .obj, .stl, .off), or the name of a shipped 
 
 
 def law_of(name: str, given: float | str) -> float | Distribution:
-    """Return the value of a tool's argument as a number or a distribution.
+    """Return the value of a tool's argument, such as friction, as a number or a distribution.
 
-    A text is read, such as "0.3:0.8" for an interval and "0.2|0.8" for one of both. Raises
-    `BadArgument`, which calls the argument `name`, for another text.
+    A number is returned as it is. A text is read, such as "0.3:0.8" for an interval, or "0.2|0.8"
+    for two values of equal probability. Raises `BadArgument`, which calls the argument `name`, for
+    another text.
     """
     return read_distribution(name, given) if isinstance(given, str) else given
 
@@ -154,7 +155,8 @@ def law_of(name: str, given: float | str) -> float | Distribution:
 def region_of(name: str, box: Box | None) -> Region | None:
     """Return the region of space inside a box; None for None.
 
-    `box` holds two opposite corners [m] in the frame of the cloud. Errors call it `name`.
+    `box` holds the box's least x, y and z, then its greatest [m], in the frame of the cloud. Raises
+    `BadArgument`, which calls the argument `name`, for another order.
     """
     if box is None:
         return None
@@ -167,7 +169,9 @@ class Tool:
     """Base of all tools that agents may call; the fields of a tool are its arguments."""
 
     def run(self, place: Workplace) -> Answer:
-        """Do the work, and return the answer. All files are in the folder `place`."""
+        """Run the tool, and return its answer. It reads and writes files below the folder `place`
+        alone.
+        """
         raise NotImplementedError
 
 
@@ -471,11 +475,12 @@ class PlanFromDepth(_PlanTool):
     def choose(
         self, place: Workplace, seen: _Seen, scene: Scene, out: Path, file: Path
     ) -> PlanAnswer:
-        """Plan for the objects in turn until one is easy, and return the answer for the best one.
+        """Plan for the objects of a scene in turn, and return the answer for the one of highest
+        predicted success.
 
-        It is easy if its predicted success is at least 0.9 (`ENOUGH`). `seen` is the `scene` with
-        notes. The scene is written to `file`, and the results to the folder `out`. All files are
-        below the folder `place`.
+        After an object with a predicted success of 0.9 (`ENOUGH`) or more, no further one is tried.
+        `seen` is the `scene` with notes for the user. The scene is written to `file`, and the
+        results to the folder `out`. All files are below the folder `place`.
         """
         hand, among = self.load(place)
         spec = ContactSpec(friction=self.law)
@@ -561,8 +566,9 @@ class ExplainEmpty(_HandTool, _SeenTool):
     )
 
     def run(self, place: Workplace) -> ExplainAnswer:
-        """Explain the loss of all grasps, and return the answer. All files are in the folder
-        `place`.
+        """Find why no grasp passes all checks and which change helps, and return the answer.
+
+        All files are in the folder `place`. Raises `BadArgument` for a label beside a cloud.
         """
         path = place.cloud("cloud", self.cloud)
         if is_scene(path):
@@ -801,7 +807,10 @@ class TellHealth(Tool):
     """Tell the version, the folder, the shipped hands and objects, and the installed simulators."""
 
     def run(self, place: Workplace) -> HealthAnswer:
-        """Return the answer without importing a simulator. `place` is the folder of all files."""
+        """Return the version, folder, hands, objects and simulators, without importing a simulator.
+
+        `place` is the folder of all files. The server adds `busy` and `seconds` to the answer.
+        """
         return HealthAnswer(
             version=__version__,
             folder=str(place.root),
@@ -827,7 +836,9 @@ TOOLS: dict[str, type[Tool]] = {
 
 
 def make_tool(name: str, given: dict[str, Any]) -> Tool:
-    """Return a tool with its arguments, as an agent gives them: lists for tuples.
+    """Return the tool called `name`, with the arguments that an agent has `given`, from JSON.
+
+    Lists become tuples.
 
     Raises `BadArgument` for an unknown tool, and for unknown or missing arguments. Raises it also
     for values of another type or outside their bounds.

@@ -74,8 +74,9 @@ class CloudCheck(ForPrograms):
     def judge(self) -> tuple[tuple[str, ...], clouds.CloudReport, tuple[clouds.Advice, ...]]:
         """Return notes on how the file was read, a report on the cloud's quality, and refusals.
 
-        The refusals are one `Advice` for a cloud that no single camera could have seen; else they
-        are (). Raises `BadArgument` for a file that cannot be read.
+        The refusals are one `Advice` if no single camera could have seen the cloud, and () if one
+        could. They are also () if the report already refuses the cloud. Raises `BadArgument` for a
+        file that cannot be read.
         """
         file = self.view.read("FILE", find_view(self.file, "FILE"), whole=True)
         file = inputs.without_exact_table(file, self.view.vertical)

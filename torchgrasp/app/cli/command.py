@@ -64,7 +64,7 @@ def required(help: str) -> Any:
 def positional(help: str, default: Any = dataclasses.MISSING) -> Any:
     """Return a dataclass field that is a positional command-line argument with a `help` text.
 
-    With a `default` of None it may be left out.
+    It is required unless it has a `default`, such as None.
     """
     return dataclasses.field(default=default, metadata={"help": help, "positional": True})
 
@@ -200,7 +200,8 @@ def _speaking(command: Command) -> Iterator[None]:
 
 @contextlib.contextmanager
 def naming(**options: str) -> Iterator[None]:
-    """Within the context, replace argument names in errors by the names of command-line options.
+    """Within the context, replace the name of the argument in a `BadArgument` by the name of its
+    command-line option.
 
     `options` gives the option of each argument by name, as `points="--cloud"`.
     """
@@ -216,7 +217,7 @@ def naming(**options: str) -> Iterator[None]:
 class StageProgress:
     """Progress output of a command: a line for each finished stage, and a bar on a terminal.
 
-    The bar names the current stage.
+    The bar names the stage that is running.
 
     Args:
         names: names of the stages in order.
@@ -237,7 +238,7 @@ class StageProgress:
     def end(self, name: str, message: str, value: Any = None) -> None:
         """Print the `message` of the stage `name`, which has ended, with its wall time [s].
 
-        Its result `value` is kept; the bar then shows the next stage.
+        Its result `value` is kept in `values`; the bar then shows the next stage.
         """
         now = time.perf_counter()
         self.stages.append((name, message, now - self.began))

@@ -78,7 +78,7 @@ class Doctor(ForPrograms):
 
 def find_parts() -> list[Finding]:
     """Return the state of every part of the installation: the library, Python, packages, processor,
-    GPU, simulators and extras.
+    GPU, simulators and extras, which are groups of optional packages.
     """
     hands = ", ".join(list_hands())
     gpu = "none visible to torch; everything runs on the processor"  # no fault
@@ -103,8 +103,8 @@ def find_parts() -> list[Finding]:
 def find_extras() -> list[Finding]:
     """Return the state of every extra, a group of optional packages, but those of the simulators.
 
-    One that is not complete has no `fix`, as only single commands need it. Then `found` says how to
-    install it.
+    An incomplete extra has an empty `fix`, as only single commands need it. Then `found` says how
+    to install it.
     """
     try:
         lines = importlib.metadata.requires("torchgrasp") or []

@@ -163,7 +163,7 @@ class Evaluate(_Trials, ForPrograms):
 
     def disturbed(self, test: evaluation.Protocol) -> evaluation.Protocol:
         """Return the protocol `test` with the displacement, push, second look and number of trials
-        that the user set.
+        that the user set by options.
 
         Raises `BadArgument` for --displaced with a protocol that does not lift.
         """
@@ -253,7 +253,8 @@ class Evaluate(_Trials, ForPrograms):
 def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
     """Return object name and view name of every view of the folder `objects` that is evaluated.
 
-    An object without views has one pair with the view name "".
+    `spec` says which objects, and how many views of each. An object without views, or one whose
+    entry is malformed, has one pair with the view name "".
     """
     names = []
     for name, entry in read_entries(objects, spec.only).items():
@@ -264,7 +265,7 @@ def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
 
 
 def print_score(score: ViewScore, widths: tuple[int, int]) -> None:
-    """Print one line with the result of a view.
+    """Print one line with the result of a view: names of object and view, and how its grasps did.
 
     `widths` are the widths [characters] of the columns with the names of object and view.
     """
@@ -289,10 +290,11 @@ def _print_cells(cells: tuple[object, ...], widths: tuple[int, int]) -> None:
 
 
 def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
-    """Print the success rates of all objects and of each group, failures by stage and cause, and
-    times.
+    """Print the success rates of all objects and of each group of them, failures by stage and
+    cause, and times.
 
-    `protocol` and `tried` are printed as the title; `summary` is what `summarise` returned.
+    `protocol` and `tried`, texts on how and what was tested, are printed as the title. `summary`
+    holds the statistics of an evaluation, by name (`torchgrasp.evaluation`).
     """
     rows = [(text, format_share(summary[key])) for key, text in SHARE_NAMES.items()]
     for name, group in summary["by_group"].items():

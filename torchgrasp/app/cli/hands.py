@@ -308,15 +308,16 @@ def list_faults(hand: str | Path, fingers: str = "default") -> tuple[str, ...]:
 def list_unusual(hand: Hand) -> list[str]:
     """Return a warning for each kind of number in a hand's URDF that is outside the usual range.
 
-    The kinds are sizes, distances, masses, and the joints' ranges, efforts and velocities. One more
-    warning names joints with soft limits, which the library ignores.
+    The kinds are sizes, distances, masses, densities, and the joints' ranges, efforts and
+    velocities. One more warning names joints whose <safety_controller> has narrower limits, which
+    the library ignores.
     """
     urdf = read_urdf(hand.urdf_path)
     return find_unusual(urdf, shape_points(urdf, urdf.path.parent))
 
 
 def describe_sets(hand: Hand) -> str:
-    """Return a text that lists the declared sets of fingers with which a hand can grasp."""
+    """Return a text with a line for each set of grasping fingers that hand.toml declares."""
     rows = [(one.source.option, ", ".join(one.finger_names)) for one in finger_sets(hand, "auto")]
     return f"sets of fingers:\n{format_columns(rows, left={0, 1})}"
 
@@ -324,8 +325,8 @@ def describe_sets(hand: Hand) -> str:
 def describe_abilities(abilities: HandAbilities) -> str:
     """Return a text with the abilities of a hand with one set of fingers, as two tables.
 
-    One has the force [N] of each fingertip. The other has, for each two tips, their span [m] and
-    the widths [m] that they can hold.
+    One has the force [N] of each fingertip. The other has a line for each two fingertips: their
+    least and greatest distance [m], and the widths [m] that they can hold.
     """
     widths = f"{abilities.least_width:.3f} to {abilities.greatest_width:.3f} m"
     # a hand of which no two tips ever face each other
@@ -350,9 +351,11 @@ def describe_abilities(abilities: HandAbilities) -> str:
 def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
     """Return warnings about a hand without faults, each with its fix.
 
-    They tell if few postures are free of self-collision, or if few can hold an object. They name
-    the pads that seldom face the other fingers. `joints` (n, h) are n random postures of the h
-    actuated joints [rad].
+    With three fingers, they tell if fewer than 20 % of the postures are free of self-collision
+    (`TRIAL.least_free`). With more fingers this share may be less. They tell if
+    fewer than 0.1 % of the free postures can hold an object. They name the fingertip pads that face
+    the others in fewer than 2 % of these. `joints` (n, h) are n random postures of the h actuated
+    joints [rad].
     """
     warnings = []
     free = hand.self_clearance(joints) > 0
@@ -407,6 +410,8 @@ def _try_objects(hand: Hand, bar: tqdm) -> bool:
 def describe(hand: Hand, joints: torch.Tensor) -> str:
     """Return a text about a hand: its joints, its fingers, and statistics of random postures.
 
+    The statistics are the shares free of self-collision and able to hold an object, and the
+    distances of the fingertips.
     `joints` (n, h) are n random postures of the h actuated joints [rad].
     """
     points, normals = hand.fingertips(joints)
@@ -536,10 +541,11 @@ class HandTrain(Command):
 
 
 def choose_components(hand: Hand, seed: int, workers: int) -> int:
-    """Return the number of Gaussians with the least Bayesian information criterion (BIC), on
-    separate random postures.
+    """Return the number of Gaussians of a hand's posture model with the least Bayesian information
+    criterion (BIC).
 
-    The BIC curve is printed. The postures are drawn with the random seed `seed` + 1. `workers` is
+    Numbers up to 64 (`TRAIN.most`) are compared on random postures apart from those of the fit. The
+    BIC curve is printed. The postures are drawn with the random seed `seed` + 1. `workers` is
     the number of threads that sample them.
     """
     apart = sample_configurations(hand, TRAIN.postures, seed + 1, workers, "grasping")

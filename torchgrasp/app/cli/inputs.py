@@ -91,11 +91,11 @@ class ViewOptions:
     def read(self, name: str, path: Path, whole: bool = False) -> CloudFile:
         """Return the cloud [m] in the file at `path`, read as the options say.
 
-        It is in the frame of the file; with --camera-pose, in that to which the pose leads. By
-        default it is checked, and at most 100,000 random points (`MOST_POINTS`) are kept. With
-        `whole`, clouds of any size and extent are accepted, and all points are kept. Errors call
-        the file `name`. Raises `BadArgument` for options that exclude each other, and for an
-        unusable cloud.
+        It is in the frame of the file; with --camera-pose, it is moved into the frame in which this
+        pose is given. By default it is checked, and at most 100,000 random points (`MOST_POINTS`)
+        are kept. With `whole`, clouds of any size and extent are accepted, and all points are kept.
+        Raises `BadArgument` for options that exclude each other, and for an unusable cloud. It
+        calls the file `name`.
         """
         if self.viewpoint is not None and (self.no_viewpoint or self.camera_pose is not None):
             raise BadArgument(
@@ -148,7 +148,7 @@ class CloudOptions(ViewOptions):
     no_table: bool = option(False, "there is no table")
 
     def with_table_of(self, file: CloudFile) -> "CloudOptions":
-        """Return the options with the table of a file as --table.
+        """Return these options with the table that a cloud's file states as --table.
 
         They are returned unchanged if --table or --no-table is given, or if the file has no table.
         """
@@ -161,7 +161,9 @@ class CloudOptions(ViewOptions):
     def given_table(self) -> Plane | float | None:
         """The table of --table in the frame of the cloud; None if it is not given.
 
-        It is a plane, or a height z [m].
+        It is a plane, or a height z [m]. With --up, a height along this direction gives a plane.
+        Raises `BadArgument` for another count of numbers than one or four, or a normal of length
+        zero.
         """
         if self.table is None:
             return None
@@ -173,10 +175,10 @@ class CloudOptions(ViewOptions):
         return height if self.vertical is None else Plane(self.vertical, height)
 
     def plane(self, cloud: PointCloud) -> Plane | float | None:
-        """Return the table in the frame of the cloud: a plane, a height z [m], or None for none.
+        """Return the table in the frame of the cloud: a plane, a height z [m], or None.
 
-        By default the table is at the lowest point of the cloud that is no outlier. Raises
-        `BadArgument` for --table and --no-table together.
+        None means no table (--no-table). By default the table is at the lowest point of the cloud
+        that is no outlier. Raises `BadArgument` for --table and --no-table together.
         """
         table = self.table
         if table is not None and self.no_table:
@@ -202,7 +204,8 @@ class CloudOptions(ViewOptions):
         return plane.normal
 
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
-        """Return advice on the quality of a cloud.
+        """Return advice on the quality of a cloud, such as on noise or a missing side; () if it is
+        good.
 
         `table` is a plane, a height z [m], or None for no table, in the frame of the cloud. Raises
         `BadArgument` for a fault with which no grasp should be planned, such as a wrong unit.
@@ -288,9 +291,10 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
 def read_region(name: str, text: str | None) -> Region | None:
     """Return the region of space that the text of the option `name` describes; None for None.
 
-    The text holds six numbers, two corners of a box, or the path of a closed mesh. Both are in
-    metres, in the frame of the cloud. A note is printed for a box whose sides are all above 2 m.
-    Raises `BadArgument` for another count of numbers, or an unusable mesh.
+    The text is the path of a closed mesh, or six numbers of a box. These are its least, then its
+    greatest corner (x, y, z). Both are in metres, in the frame of the cloud. A note is printed for
+    a box whose sides are all above 2 m. Raises `BadArgument` for another count or order of numbers,
+    or an unusable mesh.
     """
     with naming(mesh=name, low=name, high=name):
         try:
@@ -313,8 +317,8 @@ def read_region(name: str, text: str | None) -> Region | None:
 def read_distribution(name: str, text: str) -> float | Distribution:
     """Return the number or the distribution that the text of the option `name` holds.
 
-    Examples are "0.5", the interval "0.3:0.8", and "0.2|0.8" for one of both. Raises `BadArgument`,
-    which names the option, for another text.
+    Examples are "0.5", the interval "0.3:0.8", and "0.2|0.8" for two values of equal probability.
+    Raises `BadArgument`, which names the option, for another text.
     """
     with naming(text=name, parts=name, weights=name):
         return Distribution.read(text)
@@ -323,9 +327,10 @@ def read_distribution(name: str, text: str) -> float | Distribution:
 def without_exact_table(file: CloudFile, up: Tensor | None) -> CloudFile:
     """Return a cloud without the points of its table, if they lie exactly in a plane.
 
-    Only a simulator gives such points. Their plane becomes the `table` of the result, and a note
-    says so. Any other cloud, and one whose table is known, is returned unchanged. `up` (3,) is the
-    unit vector that points up, in the frame of the cloud; None means z.
+    Only a simulator gives such points: half of them are within 0.02 mm of a plane. This plane
+    becomes the `table` of the result, and a note says so. Any other cloud, and one whose table is
+    known, is returned unchanged. `up` (3,) is the unit vector that points up, in the frame of the
+    cloud; None means the z axis.
     """
     if file.table is not None:
         return file
@@ -346,9 +351,9 @@ def print_notes(notes: tuple[str, ...], advice: tuple[Advice, ...] = ()) -> None
 
 
 def check_folder(path: Path) -> None:
-    """Raise `OutputError` if a folder cannot be written, by a test with a temporary file.
+    """Raise `OutputError` if no file can be written in a folder, by a test with a temporary file.
 
-    Folders made for the test are removed.
+    A missing folder is created for the test, and removed again.
     """
     made: list[Path] = []
     try:
@@ -374,9 +379,9 @@ def holding(
 ) -> Iterator[None]:
     """Within the context, lock the folder or file at `path` against other runs.
 
-    `hold(path)` returns the context in which it is locked, by default that of a folder. A `path` of
-    None locks nothing. Raises `OutputError`, which names the option `name`, if another run has the
-    lock or nothing can be written.
+    `hold(path)` returns the context that locks it: `hold_folder` by default, `hold_file` for a
+    file. A `path` of None locks nothing. Raises `OutputError`, which names the option `name`, if
+    another run has the lock or nothing can be written.
     """
     with contextlib.ExitStack() as held:
         if path is not None:
@@ -405,10 +410,10 @@ def describe_table(table: Plane | float) -> str:
 
 
 def object_name(path: Path) -> str:
-    """Return a name for the object of a file: the file's name or, if it is generic, the folder's.
+    """Return a name for the object in a file: the file's name without its ending, such as "jug".
 
-    Generic names are those such as mesh.ply and view0.ply. For cloud.ply and similar files the name
-    is "object in cloud.ply".
+    For mesh.ply, view0.ply and the like it is the name of the file's folder. For files called
+    cloud, model, points or scan it is "object in cloud.ply", with the file's name.
     """
     if re.fullmatch(r"(mesh|view\d*)(_noisy)?", path.stem):
         return path.resolve().parent.name or "object"

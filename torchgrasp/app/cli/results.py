@@ -46,10 +46,11 @@ def make_run(
 ) -> Run:
     """Return the `Run` of a plan, the record of its inputs and results for reports.
 
-    It also says what lowers the predicted success of the best executable grasp most. And it says
-    from where a second view would help. The arguments up to `grasps` are the first fields of `Run`,
-    and `more` are other fields by name. `shape` is the estimated shape of the object. `task` is the
-    task for which success is predicted.
+    The record also says what lowers the predicted success of the best executable grasp most. And it
+    says from where a second view would help. `name` and `path` are the object's name and the file
+    of the cloud. `spec` holds the constraints on contacts, and `grasps` the results of planning.
+    `shape` is the estimated shape of the object. `task` is the task for which success is predicted.
+    `more` are other fields of `Run` by name.
     """
     hand = hand_of(grasps, hand)
     costs = [
@@ -141,9 +142,10 @@ def describe_look(view: NextView) -> dict[str, Any]:
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
-    """Return the closed mesh [m] of --mesh and, for a shipped object, its convex parts.
+    """Return the closed mesh [m] in a file, an object's true mesh, and its convex parts.
 
-    The parts are None for any other mesh.
+    The parts, of which simulators make collision shapes, exist for shipped objects alone. They are
+    None for any other mesh.
     """
     with naming(path="--mesh", mesh="--mesh"):
         mesh = read_mesh(path)
