@@ -51,8 +51,10 @@ def read_mjcf(
     All files of the MJCF lie below the folder `meshes`; None means the folder of the MJCF. `root`
     names a body of the hand, if the file has several hands; "" if not. `tips` are names of sites or
     bodies that the user chose as fingertips. With `visual`, bodies without collision geoms take
-    their visual ones. Raises `HandFileError` for a file that is malformed or too large, and for ball
-    joints and other parts without a counterpart in a URDF. Raises `BadArgument` for an unknown `root`, and
+    their visual ones.
+
+    Raises `HandFileError` for a file that is malformed or too large. Raises it also for ball joints
+    and other parts that no URDF can hold. Raises `BadArgument` for an unknown `root`, and
     `MissingExtra` if MuJoCo is not installed.
     """
     mujoco = import_mujoco()

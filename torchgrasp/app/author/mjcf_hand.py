@@ -207,9 +207,9 @@ class ModelHand:
         """Return which joints of the hand lead, which follow others, and which stand still.
 
         A motor sets a leading joint; others follow by linear coupling. Actuators may drive joints
-        and fixed tendons; linear equalities may tie them to each other.
-        Raises `HandFileError` for other elements that move the hand, such as spatial tendons or a
-        closed loop of bodies. Raises it also for equalities that contradict each other.
+        and fixed tendons; linear equalities may tie them to each other. Raises `HandFileError` for
+        other elements that move the hand, such as spatial tendons or a closed loop of bodies.
+        Raises it also for equalities that contradict each other.
         """
         model = self.model
         own = self.joints
@@ -557,9 +557,10 @@ class ModelHand:
 
 
 def names_of(model: Any, kind: str, count: int) -> list[str]:
-    """Return the names of all elements of a kind, such as "body", in the order of the model.
+    """Return the names of all elements of a kind, such as "body", in a compiled MuJoCo model.
 
-    `count` is their number. An element without a name gets a new one, such as "body_3".
+    They are in the order of the model, and `count` is their number. An element without a name gets
+    a new one, such as "body_3".
     """
     given = [getattr(model, kind)(k).name for k in range(count)]
     taken = set(given)

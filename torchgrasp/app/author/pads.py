@@ -170,7 +170,7 @@ def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> li
 
 
 def is_primitive(link: Link) -> bool:
-    """Return whether the collision shape of a link is a single box, cylinder or sphere."""
+    """Return whether a link has a single collision shape, a box, cylinder or sphere."""
     return len(link.shapes) == 1 and link.shapes[0].kind != "mesh"
 
 

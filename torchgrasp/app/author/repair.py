@@ -414,8 +414,8 @@ def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
     repair.
 
     A link without mass gets that of water in half its bounding box. An inertia or mass centre is
-    impossible if no body of the link's size and mass has it. The inertia then becomes that of a
-    box of this mass and size. An impossible mass centre becomes the middle of the bounding box.
+    impossible if no body of the link's size and mass has it. The inertia then becomes that of a box
+    of this mass and size. An impossible mass centre becomes the middle of the bounding box.
     `surfaces` holds points (n, 3) [m] on each link, by its name, in its frame.
     """
     links = []

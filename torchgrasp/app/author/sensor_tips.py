@@ -109,10 +109,11 @@ class Sensor(NamedTuple):
 
 
 def find_sensors(tips: Sequence[str], guess: Guess, pads: Sequence[Pad]) -> list[Sensor]:
-    """Return a sensor tip for each of the `pads` that `extend_pads` moved.
+    """Return the sensor tips of a hand, one for each of the `pads` that `extend_pads` moved.
 
-    `guess` holds the pads before they were moved, and `pads` those afterwards, in the order of the
-    links `tips`.
+    A sensor tip is the end that a tactile sensor adds to a fingertip. `guess` holds the pads before
+    they were moved, and `pads` those afterwards. Both are in the order of `tips`, the names of the
+    fingertip links.
     """
     found = []
     for tip, before, way, pad in zip(tips, guess.pads, guess.outward, pads, strict=True):

@@ -73,9 +73,9 @@ def keep_visuals(
     """Return the visual meshes of a published URDF for the links of its repaired copy `clean`, by
     link.
 
-    A mesh is its corners (v, 3) [m] in the link's frame, and its faces (t, 3), indices of
-    corners. A link of `clean` also gets the meshes of the links that were merged into it. Each of
-    the `mergers` gives, for every link that was merged, the link that took it over. They are in the
+    A mesh is its corners (v, 3) [m] in the link's frame, and its faces (t, 3), indices of corners.
+    A link of `clean` also gets the meshes of the links that were merged into it. Each of the
+    `mergers` gives, for every link that was merged, the link that took it over. They are in the
     order of merging. Links that stay have the same frames in both URDFs. Mesh files lie inside
     `folder`. A link with a missing or malformed visual is left out.
     """

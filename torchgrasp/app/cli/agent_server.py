@@ -312,8 +312,8 @@ def say(told: GraspError | str) -> str:
     """Return an error or advice as one line, in which an option such as --depth-unit becomes
     depth_unit.
 
-    Agents know options by these names, the arguments of tools. A line with a whole command line,
-    as `torchgrasp grasp jug`, keeps its options.
+    Agents know options by these names, the arguments of tools. A line with a whole command line, as
+    `torchgrasp grasp jug`, keeps its options.
     """
     line = one_line(told)
     if LIBRARY in line:

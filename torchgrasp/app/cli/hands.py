@@ -352,10 +352,9 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
     """Return warnings about a hand without faults, each with its fix.
 
     With three fingers, they tell if fewer than 20 % of the postures are free of self-collision
-    (`TRIAL.least_free`). With more fingers this share may be less. They tell if
-    fewer than 0.1 % of the free postures can hold an object. They name the fingertip pads that face
-    the others in fewer than 2 % of these. `joints` (n, h) are n random postures of the h actuated
-    joints [rad].
+    (`TRIAL.least_free`). With more fingers this share may be less. They tell if fewer than 0.1 % of
+    the free postures can hold an object. They name the fingertip pads that face the others in fewer
+    than 2 % of these. `joints` (n, h) are n random postures of the h actuated joints [rad].
     """
     warnings = []
     free = hand.self_clearance(joints) > 0
@@ -411,8 +410,8 @@ def describe(hand: Hand, joints: torch.Tensor) -> str:
     """Return a text about a hand: its joints, its fingers, and statistics of random postures.
 
     The statistics are the shares free of self-collision and able to hold an object, and the
-    distances of the fingertips.
-    `joints` (n, h) are n random postures of the h actuated joints [rad].
+    distances of the fingertips. `joints` (n, h) are n random postures of the h actuated joints
+    [rad].
     """
     points, normals = hand.fingertips(joints)
     free = hand.self_clearance(joints) > 0
@@ -545,8 +544,8 @@ def choose_components(hand: Hand, seed: int, workers: int) -> int:
     criterion (BIC).
 
     Numbers up to 64 (`TRAIN.most`) are compared on random postures apart from those of the fit. The
-    BIC curve is printed. The postures are drawn with the random seed `seed` + 1. `workers` is
-    the number of threads that sample them.
+    BIC curve is printed. The postures are drawn with the random seed `seed` + 1. `workers` is the
+    number of threads that sample them.
     """
     apart = sample_configurations(hand, TRAIN.postures, seed + 1, workers, "grasping")
     with make_bar(TRAIN.most, "fit", desc="components") as bar:

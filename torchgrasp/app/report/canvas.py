@@ -84,7 +84,7 @@ class Framing:
     # straight down, or up from below the table, a camera shows little
     lowest: float = 0.27  # least rise of the direction for each metre along the ground
     highest: float = 0.84  # greatest rise of the direction for each metre along the ground
-    # distance of the camera, over the least one at which all corners are in view
+    # distance of the camera, divided by the least one at which all points are in view
     margin: float = 1.12
     # length of the horizontal part of a direction below which it counts as vertical
     level: float = 1e-9
@@ -100,7 +100,7 @@ class Framing:
 class BarLayout:
     """Layout of a colour bar at the bottom of a picture [pixels]."""
 
-    side: int = 5  # width of the picture over the free width on each side of the bar
+    side: int = 5  # width of the picture, divided by the free width on each side of the bar
     top: int = 24  # upper end of the strip, from the bottom of the picture
     bottom: int = 10  # lower end of the strip, from the bottom of the picture
     font: int = 20  # size of numbers and title
@@ -119,7 +119,7 @@ PNG_LEVEL = 4  # of compression: higher is slower and hardly smaller
 
 
 class Canvas:
-    """A collection of shapes that is rendered to one picture."""
+    """A collection of shapes that is rendered to one picture, in a frame where z is up [m]."""
 
     def __init__(self) -> None:
         self.solid: list[Triangles] = []
@@ -136,9 +136,10 @@ class Canvas:
     ) -> None:
         """Add a mesh with one colour "#rrggbb", or with a colour in [0, 1] for each vertex.
 
-        `vertices` [m] have the vertex `normals`. Without them, edges where faces bend by more than
-        40 degrees (`SMOOTH_BEND`) look sharp. `faces` (t, 3) are indices of three vertices. With
-        `lit` False the mesh gets no shading. A `transparent` mesh shows the opaque ones behind it.
+        `vertices` [m] have the vertex `normals`, of any length and either sign. If these are None,
+        edges where faces bend by more than 40 degrees (`SMOOTH_BEND`) look sharp. `faces` (t, 3)
+        are indices of three vertices. With `lit` False the mesh gets no shading. A `transparent`
+        mesh shows the opaque ones behind it.
         """
         corners = vertices[faces]
         bent = sharp_normals(vertices, faces) if normals is None else normals[faces]
@@ -149,7 +150,7 @@ class Canvas:
         (self.transparent if transparent else self.solid).append(triangles)
 
     def add_points(self, points: Points, colors: Points) -> None:
-        """Add points (n, 3) [m] as small balls.
+        """Add points (n, 3) [m] as small balls, whose size is a share of the points' extent.
 
         `colors` (n, 3) are red, green and blue in [0, 1].
         """
@@ -167,8 +168,8 @@ class Canvas:
     ) -> None:
         """Add n arrows of one `length` [m], each with a small ball at its start.
 
-        `points` (n, 3) [m] are the starts, `directions` (n, 3) unit vectors, and `colors` n texts
-        "#rrggbb".
+        `points` (n, 3) [m] are the starts of the arrows, and `directions` (n, 3) unit vectors along
+        them. `colors` are n texts "#rrggbb".
         """
         sections = MARKS.arrow_sections
         head = trimesh.creation.cone(
@@ -192,7 +193,7 @@ class Canvas:
         table: Plane | float | None,
         shadows: Sequence[tuple[np.ndarray, np.ndarray]] = (),
     ) -> None:
-        """Add an unshaded round table top; without a table nothing is added.
+        """Add an unshaded round table top below the shapes; a `table` of None adds nothing.
 
         `corners` (n, 3) [m] are points that the picture must show. The table top reaches a little
         beyond their extent in x and y, and has the same centre. The `table` is level: its height z
@@ -230,10 +231,10 @@ class Canvas:
     def render_png(
         self, corners: Points, direction: Direction, bar: tuple[str, float, str] | None = None
     ) -> bytes:
-        """Return a PNG that shows all `corners` (n, 3) [m].
+        """Return the bytes of a PNG of the shapes, with all points `corners` (n, 3) [m] in view.
 
-        `direction` points to the camera. `bar` holds title, largest value and colour map of a
-        colour bar below the picture; None means no bar.
+        `direction` (x, y, z), of any length, points to the camera. `bar` holds title, largest value
+        and matplotlib's name of the colours of a colour bar below the picture. None means no bar.
         """
         camera = frame_camera(corners, direction, FRAMING.bar_drop if bar else 0.0)
         image = Image.fromarray(self.render(camera))
@@ -245,11 +246,12 @@ class Canvas:
 def frame_camera(
     corners: Points, direction: Direction, drop: float = 0.0, size: tuple[int, int] = SIZE
 ) -> Camera:
-    """Return a camera in `direction` that sees all `corners` (n, 3) [m], with z up.
+    """Return a camera that sees all points `corners` (n, 3) [m] from a direction, with z up.
 
-    The direction to it rises by 0.27 to 0.84 m (`FRAMING`) for each metre along the ground. A
-    steeper or flatter `direction` is changed. The lowest fraction `drop` of its picture stays
-    empty; `size` is the width and height of the picture [pixels].
+    `direction` (x, y, z), of any length, points from the points to the camera. If it does not rise
+    by 0.27 to 0.84 m (`FRAMING`) for each metre along the ground, it is changed. The lowest
+    fraction `drop` of the picture stays empty. `size` is the width and height of the picture
+    [pixels].
     """
     tangent = np.tan(np.deg2rad(FRAMING.angle) / 2)
     x, y, z = direction
@@ -309,17 +311,19 @@ def rgb(color: str) -> Color:
 
 
 def map_colors(values: Float[np.ndarray, " n"], name: str) -> Points:
-    """Return red, green and blue (n, 3), in [0, 1], of `values` in [0, 1].
+    """Return the colours (n, 3) that a colour map gives to `values` (n,) in [0, 1].
 
-    `name` is the name of a colour map of matplotlib.
+    They are red, green and blue in [0, 1]. `name` is the name of a colour map of matplotlib.
     """
     return matplotlib.colormaps[name](values)[:, :3]
 
 
 def color_std(std_m: Float[np.ndarray, " n"]) -> tuple[Points, float]:
-    """Return the colours (n, 3) of standard deviations [m], and the value of the last colour [m].
+    """Return the colours (n, 3) of standard deviations (n,) [m], and the value of the last colour
+    [m].
 
-    That value is the 99 % quantile; all greater ones have the same colour.
+    The colours are red, green and blue in [0, 1]. The value of the last one is the 99 % quantile of
+    the standard deviations; all greater ones have the same colour.
     """
     highest = float(np.quantile(std_m, STD_QUANTILE)) if len(std_m) else 0.0
     most = max(highest, LEAST_STD)
@@ -349,14 +353,14 @@ def draw_bar(image: Any, title: str, most: float, colors: str) -> None:
 
 
 def encode_png(image: Any) -> bytes:
-    """Return the bytes of a PNG of a Pillow image."""
+    """Return a Pillow image as the bytes of a PNG file."""
     buffer = io.BytesIO()
     image.save(buffer, format="PNG", compress_level=PNG_LEVEL)
     return buffer.getvalue()
 
 
 def encode_figure(figure: Any) -> bytes:
-    """Return the bytes of a PNG of a matplotlib figure."""
+    """Return a matplotlib figure as the bytes of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()

@@ -23,31 +23,41 @@ CREEP = 0.01  # fingertips that stick slide more slowly than this [m/s]
 
 
 def mass_centre(mesh: "trimesh.Trimesh") -> Float[Tensor, "3"]:
-    """Return the centre of mass [m] of a closed mesh."""
+    """Return the centre of mass (3,) [m] of a closed mesh of uniform density, in its frame."""
     return real(np.array(mesh.center_mass))
 
 
 class Moment(NamedTuple):
-    """A key moment of a closing: the index of its control tick, and its name in the film strip."""
+    """A key moment of a simulated closing.
+
+    `tick` is its index among the recorded control ticks, the periods of the controller. `name` is
+    its title in the film strip, such as "pressed".
+    """
 
     tick: int
     name: str
 
     @property
     def color(self) -> str:
-        """The colour "#rrggbb" of the moment's title and line in the film strip."""
+        """The colour "#rrggbb" of the moment's title and line in the film strip: red for the loss
+        of the object.
+        """
         return ALARM if self.name == LOST else INK
 
 
 def touching(closure: ClosureResult) -> Bool[Tensor, "t f"]:
-    """Return a mask (t, f) of the fingertips that touch the object at each of t control ticks."""
+    """Return a mask (t, f): which of f fingertips touch the object at each of t control ticks.
+
+    A control tick is a period of the controller.
+    """
     return closure.trace.normals.isfinite().all(-1)
 
 
 def first_touches(closure: ClosureResult) -> list[int]:
     """Return the index of the control tick at which each finger first touched the object.
 
-    The order is that of `closure.contact_order`; fingers that never touched are left out.
+    A control tick is a period of the controller. The order is that of `closure.contact_order`, from
+    the first touch to the last. Fingers that never touched are left out.
     """
     touched = touching(closure)
     return [int(touched[:, finger].int().argmax()) for finger in closure.contact_order]
@@ -56,10 +66,12 @@ def first_touches(closure: ClosureResult) -> list[int]:
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     """Return the index of the control tick at which the object was lost; None if it was held.
 
-    It was lost when it was pushed away by 50 mm. It was also lost when it slipped by 20 mm or
-    turned by 30 degrees in the hand. A third case is that fewer than two fingers still touched it.
-    An object that was put down as too heavy was lost at the hand's greatest height. `centre` is its
-    centre of mass [m] in the frame of the grasp, where z is up.
+    A control tick is a period of the controller. The object was lost when it was pushed away by 50
+    mm. It was also lost when it slipped by 20 mm or turned by 30 degrees in the hand. A third case
+    is that fewer than two fingers still touched it. An object that was put down as too heavy was
+    lost at the hand's greatest height. A trial that began with an overlap, or diverged, lost it at
+    its last tick. `centre` is the object's centre of mass [m] in the frame of the grasp, where z is
+    up.
     """
     if closure.held:
         return None
@@ -88,9 +100,10 @@ def explain_loss(
 ) -> str:
     """Return a sentence on when and in which phase the object was lost, and on the cause.
 
-    The cause is the finger that failed first, or the status of the closing. `centre` is the
-    object's centre of mass [m] in the frame of the grasp, where z is up. `fingers` are the names of
-    the fingers. The text is "" if the object was held.
+    The cause is the finger that never touched, or first slid or let go; else the status of the
+    closing. `centre` is the object's centre of mass [m] in the frame of the grasp, where z is up.
+    `fingers` are the names of the fingers, in the order of the record. The text is "" if the object
+    was held.
     """
     tick = find_loss(closure, centre)
     if tick is None:
@@ -147,10 +160,11 @@ def moments_of(
 ) -> list[Moment]:
     """Return the key moments that the film strip of a closing shows, in the order of time.
 
-    They are the open hand, the first touch, the ends of closing and pressing, the loss, and the
-    last tick. If the hand closed several times, the begin of the last closing is another. Those
-    that did not happen are left out. `centre` is the object's centre of mass [m] in the frame of
-    the grasp, where z is up. `fingers` are the names of the fingers.
+    They are the open hand, the first touch, the ends of closing and pressing, and the loss of the
+    object. The last is the end of the record. If the hand closed several times, the begin of the
+    last closing is another. Moments that did not happen are left out. Of two at the same control
+    tick, one is kept. `centre` is the object's centre of mass [m] in the frame of the grasp, where
+    z is up. `fingers` are the names of the fingers, in the order of the record.
     """
     found = [Moment(tick_of(closure, 0), "open hand")]
     if closure.contact_order:

@@ -22,9 +22,10 @@ FAR = 0.25  # an object this far from its first place [m] is lost, and is not fr
 
 
 def finite_ticks(closure: ClosureResult) -> Int[Tensor, " k"]:
-    """Return the indices (k,) of the control ticks with finite poses and joints.
+    """Return the indices (k,) of the recorded control ticks with finite poses and joints.
 
-    Other ticks come from a diverged simulation.
+    A control tick is a period of the controller. Ticks with NaN or infinity come from a diverged
+    simulation.
     """
     poses = closure.object_pose.isfinite() & closure.hand_pose.isfinite()
     return flatnonzero(closure.joints.isfinite().all(-1) & poses.all(-1).all(-1))
@@ -40,13 +41,16 @@ def draw_ticks(
     table: Plane | None,
     size: tuple[int, int],
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Yield pictures of the hand and the object at control ticks whose states are finite.
+    """Yield pictures of the hand and the object at control ticks, the periods of the controller.
+
+    Each picture holds red, green and blue of h x w pixels, 0 to 255. All have one camera.
 
     Args:
         mesh: the object's mesh [m], which `closure.object_pose` moves to a frame where z is up.
         hand: the hand of the closing.
         closure: the record of the closing, in that frame.
-        ticks: indices of the n control ticks that are drawn, in the record.
+        ticks: indices in the record of the n control ticks that are drawn. Their poses and joints
+            must be finite (`finite_ticks`).
         framed: indices from 0 to n - 1 of the drawn ticks at which the hand must be in view.
         direction: direction from the object to the camera, of any length.
         table: the level table, whose height becomes that of the object's lowest point at first;

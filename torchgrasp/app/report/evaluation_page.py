@@ -46,9 +46,10 @@ def write_evaluation(
 
 
 def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> str:
-    """Return the HTML page of an evaluation.
+    """Return the HTML page of an evaluation as text: success rates, failures and settings.
 
-    `asked` are the settings of the evaluation by name, and `scores` the results of `evaluate`.
+    `asked` are the settings that the page lists, by name. `scores` are the results of all views, as
+    `evaluate` yields them.
     """
     summary = summarise(scores)
     groups = {"": summary} | {f"{group}: ": some for group, some in summary["by_group"].items()}
@@ -151,10 +152,11 @@ def _object_rows(
 
 
 def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the name and a text for each cause for which objects were not held.
+    """Return the name and a text for each cause for which objects were not held in an evaluation.
 
-    The text holds the count, in all and by group, and the median size with its unit. `summary` is
-    what `summarise` returned.
+    The text holds how often this cause was found, in all and for each group of objects. It also
+    holds the median of a number that measures the cause, with its unit. `summary` holds the
+    statistics of the evaluation, by name.
     """
     rows = []
     for name, found in summary["causes"].items():
@@ -167,7 +169,8 @@ def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 def list_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return label and text of each number of an evaluation, such as a mean force or a time.
 
-    The labels hold the units. `summary` is what `summarise` returned.
+    The labels hold the units. `summary` holds the statistics of the evaluation, by name. The text
+    of a number that is unknown is "-".
     """
     rows = []
     for key, (text, style) in NAMES["figures"].items():

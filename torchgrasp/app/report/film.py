@@ -63,7 +63,7 @@ class PlotStyle:
     wide: float = 4.0  # width of the line of the hand's height, which a held object's would cover
     handle: float = 1.2  # length of a line in the legend, in font sizes
     legend_top: float = 0.96  # lower end of the legend, as a share of the plot's height
-    room: float = 1.1  # upper end of an axis, in largest values
+    room: float = 1.1  # upper end of an axis, divided by the largest value that it shows
     least_time: float = 0.1  # least upper end of the axis of time [s]
     least_force: float = 1.0  # least upper end of the axis of forces [N]
     least_motion: float = 20.0  # least upper end of the axis of motions [mm]
@@ -91,13 +91,13 @@ def draw_film(
     direction: Direction,
     edge: Plane | None = None,
 ) -> bytes:
-    """Return a PNG of a simulated closing: pictures of its main moments in a row, over plots
-    against time.
+    """Return the bytes of a PNG of a simulated closing: pictures of its main moments in a row, over
+    plots against time.
 
     `closure` holds the record that is plotted. `mesh` is the true object [m] in the frame of the
-    grasp, where z is up. The unit vector `direction` points from the object to the camera. The
-    level table is below the object. It ends at the vertical plane `edge`, whose normal points away
-    from it; None means no end.
+    grasp, where z is up. `direction` (x, y, z), of any length, points from the object to the
+    camera. A level table is drawn below the object. It ends at the vertical plane `edge`, whose
+    normal points away from the table; None means no end.
     """
     from matplotlib.figure import Figure
 
@@ -184,7 +184,9 @@ def _mark_moments(axes: Any, moments: list[Moment], times: list[float]) -> None:
 def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> str:
     """Return the caption of a film strip: the order of touch, and when and why the object was lost.
 
-    `mesh` is the true object [m] in the frame of the grasp, where z is up.
+    The text also says how often the hand touched something on its way, and how often it closed.
+    `mesh` is the true object [m] in the frame of the grasp, where z is up. `closure` is the record
+    of the simulated closing.
     """
 
     def times(count: int) -> str:

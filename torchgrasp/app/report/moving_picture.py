@@ -106,8 +106,8 @@ def write_film(
 
 
 def check_kind(path: Path) -> None:
-    """Raise `BadArgument` for a file that is neither .gif nor .mp4, and `MissingExtra` if no
-    encoder is installed.
+    """Raise `BadArgument` for a path that ends neither in .gif nor in .mp4. For .mp4, raise
+    `MissingExtra` if ffmpeg is not installed.
     """
     if path.suffix.lower() not in KINDS:
         raise BadArgument("path", path, f"a file that ends in {' or '.join(KINDS)}")

@@ -91,7 +91,10 @@ def make_sheet(
 
 
 def show_in_notebook(grasps: Grasps) -> str:
-    """Return the HTML that a notebook shows of grasps; without a picture if the hand is unknown."""
+    """Return the HTML that a notebook shows of grasps: a table of the best, and a picture.
+
+    The picture is left out if no grasp passed all checks, or if the grasps' hand cannot be loaded.
+    """
     try:
         hand = hand_of(grasps)
     except GraspError:  # a hand that is not shipped: `Grasps.show` takes it

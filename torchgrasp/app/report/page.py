@@ -47,7 +47,11 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
 
 
 def draw_pictures(run: Run) -> Sections:
-    """Return all pictures of a run: pairs of caption and PNG by the title of their section."""
+    """Return all pictures of a run: pairs of caption and PNG bytes, by the title of their section.
+
+    Raises `BadArgument` if the executable grasps, which passed all checks, do not touch the run's
+    mesh. It is also raised for a table above most points of the cloud.
+    """
     run = run.upright()
     table = run.spec.plane
     view = stills.view_of(run.cloud)
@@ -90,10 +94,10 @@ def draw_pictures(run: Run) -> Sections:
 
 
 def format_page(run: Run, pictures: Sections, view: str = "") -> str:
-    """Return the HTML report of a run.
+    """Return the HTML report of a run as text.
 
-    `pictures` is what `draw_pictures` returned. `view` is the address of the 3D page that is
-    linked, or "" for none.
+    `pictures` holds pairs of caption and PNG bytes by the title of their section (`draw_pictures`).
+    `view` is the address of the 3D page to which the report links, or "" for no link.
     """
     funnel = run.explanation.funnel.stages if run.explanation else ()
     trials = run.explanation.trials if run.explanation else ()

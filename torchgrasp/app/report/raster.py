@@ -78,7 +78,7 @@ class Camera(NamedTuple):
 
 
 def concatenate(parts: list[Triangles]) -> Triangles:
-    """Join several sets of triangles, or none, into one set."""
+    """Return one set with all triangles of the sets `parts`; it is empty without parts."""
     empty = np.zeros((0, 3, 3))
     none = Triangles(empty, empty, empty, np.zeros(0, dtype=bool))
     return Triangles(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
@@ -91,11 +91,11 @@ def render(
     size: tuple[int, int],
     background: Color,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pixels of a picture of opaque and transparent triangles.
+    """Return the picture (h, w, 3) that a camera sees of opaque and transparent triangles.
 
-    They are shown as the `camera` sees them. Of the transparent triangles, only the nearest layer
-    is drawn over the opaque ones (`solid`). `size` is the width and height (w, h) [pixels];
-    `background` is red, green and blue in [0, 1].
+    Its pixels are red, green and blue, 0 to 255. Of the transparent triangles, only the nearest
+    layer is drawn over the opaque ones (`solid`). `size` is the width and height (w, h) of the
+    picture [pixels]. `background` is red, green and blue in [0, 1].
     """
     samples = RASTER.samples
     width = size[0] * samples

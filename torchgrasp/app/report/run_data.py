@@ -39,7 +39,7 @@ the worst finger.
 class Run:
     """The inputs and results of one planning run, for `write_report`, `write_viewer` and others.
 
-    Cloud, surface, grasps, mesh and scene are in one frame, in metres.
+    Cloud, surface, grasps, mesh and scene are in one frame, that of the cloud, in metres.
 
     Args:
         object_name: name of the object in titles and sentences.
@@ -108,7 +108,8 @@ class Run:
         """Return the run in a frame whose z axis points up.
 
         z is the normal of the table in `spec`, and the table has the height z = 0. Without a table,
-        z points to the camera. Without both, it points where the points spread least.
+        z points to the camera. Without both, z is the direction in which the points of the cloud
+        spread least.
 
         Raises `BadArgument` if the `executable` grasps do not touch the mesh. It is also raised if
         the table is above most points of the cloud.
@@ -162,8 +163,8 @@ def verdict(run: Run) -> str:
 def closing_sentence(run: Run) -> str:
     """Return one sentence with the result of the closing on the true object.
 
-    The run must have a closing and a mesh. If the object was held, the sentence has its rise [m],
-    and its motion in the hand [mm, deg]. Otherwise it says why not.
+    The run must have a `closure` and a `mesh`. If the object was held, the sentence states its rise
+    [m] and its motion in the hand [mm, deg]. Otherwise it says why the object was not held.
     """
     upright = run.upright()
     closure = upright.closure
@@ -182,10 +183,10 @@ def closing_sentence(run: Run) -> str:
 
 
 def grasp_columns(grasps: Grasps) -> tuple[str, ...]:
-    """Return the titles of the columns of `grasp_rows`.
+    """Return the titles of the columns of a table of grasps, whose cells `grasp_rows` returns.
 
-    These are "rank", "success" and the others of `GRASP_COLUMNS`. For grasps planned for a task,
-    "task margin" is the last.
+    These are rank, success, tip error [mm], clearance [mm], pad angle [deg], closure margin and
+    surface standard deviation [mm]. For grasps planned for a task, "task margin" is the last.
     """
     return (*GRASP_COLUMNS, *["task margin"] * (grasps.certificate.task_margin is not None))
 
@@ -193,7 +194,8 @@ def grasp_columns(grasps: Grasps) -> tuple[str, ...]:
 def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
     """Return the cells of a table of the first `most` grasps as text, one tuple for each grasp.
 
-    The cells are in the order of `grasp_columns`.
+    The cells are rank, success and others, in the order of `grasp_columns`. Errors, angles and
+    standard deviations are those of the worst finger; "" means an unknown standard deviation.
     """
     rows = []
     for rank, grasp in enumerate(grasps[:most], 1):
@@ -215,7 +217,9 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
 
 
 def refusal(run: Run) -> str:
-    """Return one sentence that says why no grasp is executable: each reason with its count."""
+    """Return one sentence that says why no grasp of a run passed all checks: each reason, and how
+    many postures or initial guesses it ruled out.
+    """
     head = f"The {run.hand.name} hand has no executable grasp of {run.named_object}"
     if len(run.grasps):
         failed = run.grasps.status

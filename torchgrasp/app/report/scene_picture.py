@@ -59,7 +59,8 @@ class SceneInk:
     blur: float = 1.5  # standard deviation [pixels] that smooths the depth before its slopes
     nearest: float = 1e-3  # least depth [m]
     least: float = 1e-6  # least weight, slope and range, so that nothing is divided by 0
-    # direction to the lamp (right, down, ahead), less the unit vector that points up
+    # vector (right, down, ahead) of the camera: with the unit vector that points up added, it
+    # points to the lamp
     lamp: tuple[float, float, float] = (-0.5, 0.0, -0.8)
     ambient: float = 0.45  # brightness without the lamp
     lit: float = 0.65  # brightness that the lamp adds at most
@@ -102,7 +103,7 @@ def draw_scene(scene: Scene, path: Path | str) -> Path:
     It shows the support plane, the numbered objects, obstacles, unmeasured pixels and a legend.
 
     Args:
-        scene: the scene.
+        scene: the scene, a depth image in which table and objects were found.
         path: the file to write.
 
     Raises `OutputError` if the file cannot be written.
@@ -116,7 +117,10 @@ def draw_scene(scene: Scene, path: Path | str) -> Path:
 
 
 def encode_scene(scene: Scene) -> bytes:
-    """Return the bytes of the PNG picture of a scene that `draw_scene` writes."""
+    """Return a picture of a scene, as its camera saw it, as the bytes of a PNG file.
+
+    It shows the support plane, the numbered objects, obstacles, unmeasured pixels and a legend.
+    """
     kinds, labels = sort_pixels(scene)
     h, w = labels.shape
     palette = np.stack([rgb(color) for color in (*KINDS.values(), *OBJECTS)])
@@ -145,10 +149,12 @@ def encode_scene(scene: Scene) -> bytes:
 
 
 def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-    """Return the kind of each pixel, and the label of its object, for an image of h x w pixels.
+    """Return two images (h, w) of a scene's depth image: the kind of each pixel, and its object's
+    label.
 
     The kinds are 0 not measured, 1 not on the support, 2 support, 3 another possible support, and 4
-    obstacle. They count only where the label is 0, on no object.
+    obstacle. The support is the plane on which the objects stand. The label is 0 on no object; the
+    kinds count only there.
     """
     image = scene.image
     labels = scene.pixel_labels.cpu().numpy()

@@ -31,8 +31,8 @@ class Solid(NamedTuple):
         faces: indices of the three vertices of each of t triangles, (t, 3).
         normals: outward unit normals at the vertices.
         link: index of the link in `hand.tree.link_names`.
-        finger: index of the finger in grasp order; -1 (`PARKED`) if the link belongs to no grasping
-            finger, or to several.
+        finger: index of the finger in `hand.finger_names`; -1 (`PARKED`) if the link belongs to no
+            grasping finger, or to several.
     """
 
     vertices: Float[np.ndarray, "v 3"]
@@ -43,15 +43,15 @@ class Solid(NamedTuple):
 
     @property
     def color(self) -> str:
-        """The colour "#rrggbb" of the finger; that of the palm if there is no finger."""
+        """The colour "#rrggbb" of the finger; that of the palm if `finger` is -1."""
         return HAND if self.finger == PARKED else FINGERS[self.finger]
 
 
 def solids_of_links(hand: Hand) -> list[Solid]:
     """Return the hand as meshes [m], each in the frame of its link.
 
-    A link whose URDF has a <visual> that can be read is drawn as that mesh. Any other link is drawn
-    by its collision shapes.
+    A link with a <visual> in the URDF that can be read has one mesh, that of the visual. Any other
+    link has a mesh for each of its collision shapes.
     """
     if "solids" not in hand.derived:
         hand.derived["solids"] = _read_solids(hand)
@@ -79,7 +79,11 @@ def _read_solids(hand: Hand) -> list[Solid]:
 
 
 def solids_by_link(hand: Hand) -> dict[str, Solid]:
-    """Return one mesh [m] for each link that is drawn, in the link's frame, by the link's name."""
+    """Return one mesh [m] for each link of a hand, in the link's frame, by the link's name.
+
+    It is that of the visual or, without one, of all collision shapes. A link without either is left
+    out.
+    """
     found = {}
     solids = solids_of_links(hand)
     for link, name in enumerate(hand.tree.link_names):
@@ -100,9 +104,10 @@ def link_poses(
     names: tuple[str, ...],
     obj_from_hand: Float[Tensor, "n 4 4"],
 ) -> Float[Tensor, "n l 4 4"]:
-    """Return the poses obj_from_link [m] of all l links, in the order of `hand.tree.link_names`.
+    """Return the poses obj_from_link (n, l, 4, 4) [m] of all l links of a hand in n postures.
 
-    `joints` holds n postures of all j joints of the URDF [rad or m]. Their names are `names`, in
+    They are in the object's frame, with the links in the order of `hand.tree.link_names`. `joints`
+    (n, j) holds the positions [rad or m] of all j joints of the URDF. Their names are `names`, in
     any order. `obj_from_hand` holds the n poses of the hand in the object's frame [m].
     """
     values = joints[:, [names.index(n) for n in hand.tree.joint_names]].double()
@@ -139,9 +144,9 @@ def place_solids(hand: Hand, obj_from_link: Float[np.ndarray, "l 4 4"]) -> list[
 
 
 def finger_of_links(hand: Hand) -> dict[str, int]:
-    """Return by link name the index of the finger, in grasp order, that the link belongs to.
+    """Return for each link of a hand, by its name, the index of its finger in `hand.finger_names`.
 
-    The index is -1 (`PARKED`) for a link that belongs to no grasping finger, or to several.
+    The index is -1 (`PARKED`) for a link of no grasping finger, such as the palm, or of several.
     """
     moves = hand.tree.moves.bool().cpu()
     finger_of = {}
@@ -154,10 +159,10 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
 
 @functools.lru_cache(maxsize=512)  # a hand is drawn many times
 def round_shape(shape: LinkShape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, faces and vertex normals of a collision shape with rounded edges.
+    """Return vertices, faces and vertex normals of a box, cylinder or sphere with rounded edges.
 
-    Vertices (v, 3) [m] and outward unit normals (v, 3) are in the frame of the link. Faces (t, 3)
-    hold the indices of the vertices of t triangles.
+    `shape` is a collision shape of a link. Vertices (v, 3) [m] and outward unit normals (v, 3) are
+    in the frame of the link. Faces (t, 3) hold the indices of the vertices of t triangles.
     """
     fineness = BALL_FINENESS if shape.kind == "sphere" else 1
     ball = np.asarray(trimesh.creation.icosphere(subdivisions=fineness, radius=1.0).vertices)

@@ -65,9 +65,10 @@ FREE = 10.0  # a posture without collision is better than any with one
 
 
 def draw_cloud(cloud: PointCloud, table: Plane | float | None = None) -> bytes:
-    """Return a PNG of a cloud as its camera sees it, coloured by height.
+    """Return the bytes of a PNG of a cloud as its camera sees it, coloured by height.
 
-    `table` is the level table, or its height z [m]; None means no table.
+    The cloud is in a frame where z is up. `table` is the level table in this frame, or its height z
+    [m]; None means no table.
     """
     points = _thinned(to_array(cloud.points), STILLS.most_points)
     height = points[:, 2] - points[:, 2].min()
@@ -81,10 +82,10 @@ def draw_cloud(cloud: PointCloud, table: Plane | float | None = None) -> bytes:
 def draw_surface(
     surface: Surface, direction: Direction, table: Plane | float | None = None
 ) -> bytes:
-    """Return a PNG of the estimated surface, coloured by its standard deviation [mm].
+    """Return the bytes of a PNG of the estimated surface, coloured by its standard deviation [mm].
 
-    `direction` points to the camera. `table` is the level table, or its height z [m]; None means
-    no table.
+    The surface is in a frame where z is up. `direction` (x, y, z), of any length, points to the
+    camera. `table` is the level table, or its height z [m]; None means no table.
     """
     vertices, faces, normals = mesh_arrays(surface)
     colors, most = paint.color_std(to_array(surface.std_m))
@@ -98,10 +99,11 @@ def draw_surface(
 def draw_contacts(
     surface: Surface, contacts: Contacts, direction: Direction, table: Plane | float | None = None
 ) -> bytes:
-    """Return a PNG of the contacts of the first grasp, with normals, on the estimated surface.
+    """Return the bytes of a PNG of the contacts of the first grasp, with normals, on the estimated
+    surface.
 
-    `direction` points to the camera. `table` is the level table, or its height z [m]; None means
-    no table.
+    All are in one frame where z is up. `direction` (x, y, z), of any length, points to the camera.
+    `table` is the level table, or its height z [m]; None means no table.
     """
     canvas = paint.Canvas()
     vertices = _add_object(canvas, surface, transparent=True)
@@ -117,10 +119,12 @@ def draw_grasp(
     direction: Direction,
     table: Plane | float | None = None,
 ) -> bytes:
-    """Return a PNG of the hand of the first grasp on the estimated surface, with its contacts.
+    """Return the bytes of a PNG of the hand at the first grasp on the estimated surface, with its
+    contacts.
 
-    Without a `surface` only hand and contacts are shown. `direction` points to the camera. `table`
-    is the level table, or its height z [m]; None means no table.
+    All are in one frame where z is up. A `surface` of None shows only hand and contacts.
+    `direction` (x, y, z), of any length, points to the camera. `table` is the level table, or its
+    height z [m]; None means no table.
     """
     canvas, corners = _grasp(surface, hand, grasp)
     canvas.add_table(corners, table)
@@ -130,10 +134,11 @@ def draw_grasp(
 def draw_among(
     scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direction: Direction
 ) -> bytes:
-    """Return a PNG of the hand of the first grasp on the target, among the other objects.
+    """Return the bytes of a PNG of the hand at the first grasp on its object, among other objects.
 
-    The other objects are shown by their measured points. The `scene` is in an upright frame with
-    its table at z = 0. `direction` points to the camera.
+    The grasped object is shown by its estimated `surface`, the others by their measured points. All
+    are in one frame where z is up, with the table at z = 0. `direction` (x, y, z), of any length,
+    points to the camera.
     """
     canvas, corners = _grasp(surface, hand, grasp)
     others = (scene.labels > 0) & ~scene.rows_of()
@@ -150,10 +155,10 @@ def draw_among(
 
 
 def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
-    """Return a PNG of a hand at a posture and at both limits, and of the joints' ranges.
+    """Return the bytes of a PNG of a hand at a posture and at its joint limits, with all ranges.
 
-    `joints` [rad] is the posture of the h actuated joints. Arrows show the pad normals and the axes
-    of the palm.
+    `joints` (h,) [rad] is the posture of the h actuated joints. Arrows show the normals of the
+    fingertip pads and the axes of the hand's frame.
     """
     from matplotlib.figure import Figure
 
@@ -194,10 +199,10 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
 
 
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
-    """Return a PNG of a hand at a posture, with its fingertip normals and the axes of its palm.
+    """Return the bytes of a PNG of a hand at a posture, with fingertip normals and its axes.
 
-    `joints` [rad] are the positions of the h actuated joints. `eye` is the direction to the camera,
-    in the hand's frame.
+    `joints` (h,) [rad] are the positions of the h actuated joints. `eye` (x, y, z), of any length,
+    is the direction to the camera, in the hand's frame.
     """
     solids = solids_from_hand(
         hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints)
@@ -219,11 +224,12 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
 
 
 def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "h"]:
-    """Return the posture in which the fingertip pads face each other best.
+    """Return the posture (h,) in which the fingertip pads face each other best.
 
-    It is one of the n postures `joints` of the h actuated joints [rad], without self-collision if
-    there is one. Best is where the worst pad points most to the tips' centroid, and the tips are
-    near it.
+    It is one of the n postures `joints` (n, h) of the h actuated joints [rad]. It is one without
+    self-collision if there is any. Best is the highest score: the cosine between the normal of the
+    worst pad and the direction to the tips' centroid. From it, 1 is taken off for each 100 mm of
+    the greatest distance of a tip from the centroid.
     """
     points, normals = hand.fingertips(joints)
     inward = points.mean(1, keepdim=True) - points
@@ -236,9 +242,9 @@ def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "
 
 
 def view_of(cloud: PointCloud) -> Direction:
-    """Return the direction from the centroid of a cloud to its first camera.
+    """Return the vector (x, y, z) [m] from the centroid of a cloud to its first camera.
 
-    If the camera is unknown, it is a fixed direction from the front.
+    If the camera is unknown, it is a fixed direction from the front, (1, -0.8, 0.6).
     """
     first = cloud.split_views()[0].viewpoint
     if first is None:
@@ -248,9 +254,11 @@ def view_of(cloud: PointCloud) -> Direction:
 
 
 def facing(grasp: Grasps) -> Direction:
-    """Return a direction to the camera from which all fingers of the first grasp are visible.
+    """Return a direction (x, y, z) to a camera from which all fingers of the first grasp are
+    visible.
 
-    It is horizontally across the contact normals, raised a little, in a frame where z is up.
+    It is horizontally across the contact normals, raised by 0.4 (`STILLS.grasp_rise`) of its
+    horizontal part. The grasp is in a frame where z is up.
     """
     normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
     press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
@@ -263,7 +271,7 @@ def facing(grasp: Grasps) -> Direction:
 
 
 def rotated(direction: Direction, degrees: float) -> Direction:
-    """Return a direction, rotated by an angle [degrees] about the z axis."""
+    """Return a direction (x, y, z), rotated about the z axis by an angle [degrees] from x to y."""
     x, y, z = direction
     c = np.cos(np.deg2rad(degrees))
     s = np.sin(np.deg2rad(degrees))
@@ -271,15 +279,15 @@ def rotated(direction: Direction, degrees: float) -> Direction:
 
 
 def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
-    """Return a tensor as a NumPy array in float64."""
+    """Return a tensor of any shape and device as a NumPy array in float64, without its gradient."""
     return value.detach().cpu().double().numpy()
 
 
 def mesh_arrays(surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the vertices, faces and vertex normals of an estimated surface.
 
-    Vertices (v, 3) are in metres, faces (t, 3) hold indices of three vertices, and normals (v, 3)
-    are outward unit vectors.
+    Vertices (v, 3) are in metres, and normals (v, 3) are outward unit vectors. Faces (t, 3) hold
+    indices of three vertices.
     """
     return to_array(surface.vertices), surface.faces.cpu().numpy(), to_array(surface.normals)
 
@@ -321,7 +329,7 @@ def _add_contacts(canvas: paint.Canvas, contacts: Contacts) -> Float[np.ndarray,
 
 
 def add_solids(canvas: paint.Canvas, solids: list[Solid]) -> None:
-    """Add the links of a hand to a canvas, each in its colour.
+    """Add the meshes of a hand's links to a canvas, each in the colour of its finger.
 
     The `solids` [m] must be in the frame of the canvas, not in those of their links.
     """

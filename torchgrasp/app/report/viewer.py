@@ -56,7 +56,7 @@ class ViewerNumbers:
     grasps: int = 20  # number of the best grasps that are shown
     points: int = 10_000  # greatest number of points of a cloud
     faces: int = 40_000  # greatest number of faces of a mesh
-    ticks: int = 120  # greatest number of ticks of a replay
+    ticks: int = 120  # greatest number of moments of a replay
     # number of grid cells along the diagonal of a mesh in the first round of its thinning
     cells: int = 256
     coarser: float = 1.2  # ratio of the cells' sides in successive rounds of thinning
@@ -118,7 +118,8 @@ def show_grasps(
         cloud: the cloud that was planned on, in any form that `plan_grasps` takes. The surface on
             the page is estimated again from this cloud.
         grasps: grasps that were planned on the cloud.
-        hand: the hand of the grasps; None means the shipped hand that `grasps.meta` names.
+        hand: the hand of the grasps, its name or its folder; None means the hand that `grasps.meta`
+            names.
         browser: whether the page is opened; False only writes it.
 
     Raises `BadArgument` for a cloud that the grasps do not touch, or for another hand than that of
@@ -142,7 +143,7 @@ def show_grasps(
 
 
 def format_viewer(run: Run) -> str:
-    """Return the 3D page of a run as HTML."""
+    """Return the interactive 3D page of a run, that `write_viewer` writes, as HTML text."""
     contents = describe(run)
     # The files are one function, so that no name of theirs meets a name of the library.
     names = "scene.js", "cloud.js", "panel.js"
@@ -156,7 +157,7 @@ def format_viewer(run: Run) -> str:
 
 @functools.cache
 def three() -> str:
-    """Return the JavaScript of the library three.js with its mouse controls.
+    """Return the JavaScript of the library three.js with its mouse controls, as text.
 
     It is part of the package trimesh. Raises `RuntimeError` for a version of trimesh with another
     viewer.
@@ -173,7 +174,10 @@ def three() -> str:
 
 
 def describe(run: Run) -> dict[str, Any]:
-    """Return the contents of the 3D page as a dictionary for JSON, in an upright frame [m]."""
+    """Return the contents of a run's 3D page as a dictionary for JSON: meshes, poses and texts.
+
+    All are in a frame where z is up, in metres (`Run.upright`).
+    """
     frame = inverse(upright_frame(run.cloud.points, run.cloud.viewpoint, run.spec.plane))
     sentence = verdict(run)
     run = run.upright()
@@ -256,10 +260,11 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
 
 
 def pose_postures(hand: Hand, grasps: Grasps) -> Float[Tensor, "g p l 4 4"]:
-    """Return the poses obj_from_link [m] of all links, in each of the four `POSTURES` of g grasps.
+    """Return the poses obj_from_link [m] of all l links, in each of the p postures of g grasps.
 
-    The postures are, in order, "approach", "pre-grasp", "grasp" and "squeeze". The links are in the
-    order of `hand.tree.link_names`.
+    The four postures are, in order, "approach", "pre-grasp", "grasp" and "squeeze". The last is the
+    target with which the fingers press. The poses are in the frame of the grasps, and the links in
+    the order of `hand.tree.link_names`.
     """
     pose = grasps.obj_from_hand.double()
     opened = grasps.pregrasp.double()
@@ -314,7 +319,8 @@ def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
 def pack(values: np.ndarray, kind: str = "f4") -> dict[str, object]:
     """Return an array as a dictionary for JSON: "kind", "shape", and "data", its bytes in base64.
 
-    `kind` is the number format, little-endian: "f4", "u4" or "u1".
+    `kind` is the number format to which the values are converted, little-endian. It is "f4" for
+    float32, "u4" for uint32, or "u1" for uint8.
     """
     data = np.ascontiguousarray(values).astype(f"<{kind}").tobytes()
     return {"kind": kind, "shape": list(values.shape), "data": encode_base64(data)}
@@ -325,10 +331,12 @@ def thin_mesh(
     faces: Int[np.ndarray, "f 3"],
     most: int = VIEWER.faces,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "g 3"]]:
-    """Return the indices of the k vertices to keep, and the g faces between them.
+    """Return a mesh with at most `most` faces: the indices (k,) of the vertices that it keeps, and
+    its faces (g, 3).
 
-    There are at most `most` faces. A mesh with more keeps one vertex in each cell of a grid;
-    `vertices` are in metres. The faces returned hold indices of the kept vertices.
+    The faces hold indices of the k kept vertices. A mesh of more than `most` faces keeps one vertex
+    in each cell of a grid. The cells grow until the faces are few enough. Any other mesh is
+    unchanged. `vertices` are in metres.
     """
     kept = np.arange(len(vertices))
     thinned = faces
