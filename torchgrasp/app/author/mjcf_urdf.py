@@ -51,8 +51,8 @@ class UrdfWriter:
     def write(self, tips: Sequence[str]) -> str:
         """Return the hand as the text of a URDF; write its meshes to the folder.
 
-        Sites of the hand become links if their names are among the `tips`, or contain "tip" or
-        "TIP".
+        Sites of the hand become links if their names are among the `tips`, or contain "tip", in
+        capitals or not.
         """
         for body in self.hand.bodies:
             self._add_body(body)

@@ -354,7 +354,8 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
     With three fingers, they tell if fewer than 20 % of the postures are free of self-collision
     (`TRIAL.least_free`). With more fingers this share may be less. They tell if fewer than 0.1 % of
     the free postures can hold an object. They name the fingertip pads that face the others in fewer
-    than 2 % of these. `joints` (n, h) are n random postures of the h actuated joints [rad].
+    than 2 % of the free postures. `joints` (n, h) are n random postures of the h actuated joints
+    [rad].
     """
     warnings = []
     free = hand.self_clearance(joints) > 0

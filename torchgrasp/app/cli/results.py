@@ -142,7 +142,7 @@ def describe_look(view: NextView) -> dict[str, Any]:
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
-    """Return the closed mesh [m] in a file, an object's true mesh, and its convex parts.
+    """Return an object's true mesh [m], which is closed, from a file, and its convex parts.
 
     The parts, of which simulators make collision shapes, exist for shipped objects alone. They are
     None for any other mesh.

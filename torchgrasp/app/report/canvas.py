@@ -119,7 +119,9 @@ PNG_LEVEL = 4  # of compression: higher is slower and hardly smaller
 
 
 class Canvas:
-    """A collection of shapes that is rendered to one picture, in a frame where z is up [m]."""
+    """A collection of shapes in one frame [m] that is rendered to a picture; its z axis is drawn
+    upwards.
+    """
 
     def __init__(self) -> None:
         self.solid: list[Triangles] = []

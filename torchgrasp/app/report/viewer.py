@@ -143,7 +143,7 @@ def show_grasps(
 
 
 def format_viewer(run: Run) -> str:
-    """Return the interactive 3D page of a run, that `write_viewer` writes, as HTML text."""
+    """Return the interactive 3D page of a run, which `write_viewer` writes, as HTML text."""
     contents = describe(run)
     # The files are one function, so that no name of theirs meets a name of the library.
     names = "scene.js", "cloud.js", "panel.js"
