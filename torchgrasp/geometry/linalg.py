@@ -85,7 +85,7 @@ def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
 
 
 def perpendicular(v: Float[Tensor, "*b 3"], axis: Float[Tensor, "*c 3"]) -> Float[Tensor, "*d 3"]:
-    """Return the parts of vectors `v` that are perpendicular to unit vectors `axis`."""
+    """Return the components of vectors `v` that are perpendicular to unit vectors `axis`."""
     return v - dot(v, axis, keepdim=True) * axis
 
 
@@ -110,7 +110,7 @@ def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 def number_rows(rows: Shaped[Tensor, "n d"]) -> Int[Tensor, "n"]:
-    """Return the index (n,) of each of n rows in the sorted list of distinct rows.
+    """Return the index (n,) of each of n rows in the list of distinct rows, in lexical order.
 
     `torch.unique` of whole rows takes much longer than that of one column after the other.
     """
@@ -141,7 +141,7 @@ def number_cells(places: Float[Tensor, "n d"], side: float) -> Int[Tensor, "n"]:
 def fibonacci_sphere(
     n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5
 ) -> Float[Tensor, "n 3"]:
-    """Return n unit vectors spread evenly over the sphere, from +z to -z.
+    """Return n unit vectors (n, 3) that a spiral spreads evenly over the sphere, from +z to -z.
 
     Vector k has the azimuth `angle` * (k + `start`) [rad].
     """
@@ -153,8 +153,8 @@ def fibonacci_sphere(
 
 
 def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"]:
-    """Return vectors (..., d) shortened to the length `longest` where they are longer, in their own
-    unit.
+    """Return vectors (*b, d), shortened to the length `longest` (in their own unit) where they are
+    longer.
     """
     # a zero vector has no second derivative of its length, which does not count here
     moving = torch.where((v == 0).all(-1, keepdim=True), v.detach(), v)
@@ -208,7 +208,8 @@ def farthest_points(
     distance: Callable[[Tensor, Tensor], Tensor] | None = None,
     before: Float[Tensor, "m *d"] | None = None,
 ) -> Int[Tensor, "picks"]:
-    """Return the indices of at most `count` points, each the farthest from all points before it.
+    """Return the indices of `count` points, or of all if fewer, each the farthest from those before
+    it.
 
     The choice begins with the point of the index `first`. Points whose distances differ by at most
     the share `tie` count as equally far; the first of them is taken. Points in `before` count as
