@@ -112,7 +112,7 @@ def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return the angles [rad] of rotation matrices, from 0 to pi, accurate near both ends."""
+    """Return the angles (*b,) [rad] of rotation matrices, from 0 to pi, accurate near both ends."""
     axis = (rotation - rotation.mT)[..., [2, 0, 1], [1, 2, 0]]
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
     return torch.atan2(norm(axis), trace - 1)

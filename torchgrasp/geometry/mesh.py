@@ -178,8 +178,8 @@ def closest_on_triangles(
     lies.
 
     The `points` (n, 3) and the corners of the `triangles` (n, 3 corners, 3) have the same unit. The
-    feature (n,) is 0 inside the face. On the sides ab, bc, ca it is 1 to 3. At the corners a, b, c
-    it is 4 to 6.
+    feature (n,) is 0 inside the face. On the sides ab, bc, ca it is 1 to 3. At the corners a, b, c,
+    in the order given, it is 4 to 6.
     """
     a = triangles[:, 0]
     u = triangles[:, 1] - triangles[:, 0]

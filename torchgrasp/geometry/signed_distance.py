@@ -216,10 +216,11 @@ class SignedDistanceField(DistanceField):
 
 
 def corner_steps(dx: Int[Tensor, "*b"], dy: Int[Tensor, "*b"]) -> Int[Tensor, "8 *b"]:
-    """Return the index steps from the first corner of a grid cell to its eight corners.
+    """Return the steps (8, *b) in a grid's flattened values from a cell's first corner to its eight
+    corners.
 
-    `dx` and `dy` are the strides: the numbers of values between neighbours on the x and on the y
-    axis. The stride on the z axis is 1.
+    `dx` and `dy` (*b,) are the strides of the grids on x and y: the numbers of values between
+    neighbours. The stride on the z axis is 1.
     """
     corner = torch.arange(8, device=dx.device).view(-1, *[1] * dx.ndim)
     return corner // 4 * dx + corner // 2 % 2 * dy + corner % 2

@@ -322,11 +322,11 @@ class Posterior(Value):
 
     @kept
     def weighted(self) -> Weighted:
-        """The observed points, the weights of their distances and normals in the posterior mean,
-        and the kernel.
+        """What the posterior mean is made of: observed points, weights of their distances and
+        normals, and the kernel.
 
-        Of its fields, `x` (n, 3) are the n observed points, normalised. `a` (n,)
-        are the weights of their distances, and `b` (k, 3) those of the k observed normals.
+        Of its fields, `x` (n, 3) are the n observed points, normalised. `a` (n,) are the weights of
+        their distances, and `b` (k, 3) those of the k observed normals.
         """
         n = len(self.x)
         normals = self.weights[n:].reshape(3, self.n_oriented).T

@@ -159,9 +159,9 @@ class Completion(Value):
 
     @property
     def deviations(self) -> Float[Tensor, "m k"]:
-        """The correlated errors D [m] of the m points along their normals.
+        """The correlated errors D (m, k) [m] of the m points along their normals.
 
-        There is a column for each of k independent causes.
+        There is a column for each of k independent causes, at one standard deviation of it.
         """
         return correlated_errors(self.points, self.shared, self.asymmetry)
 

@@ -88,7 +88,7 @@ TIE = 2e-9
 
 
 def find_middle(points: Points) -> Float[Tensor, "3"]:
-    """Return the centre of the box around points (n, 3), in their unit."""
+    """Return the centre (3,) of the bounding box of points (n, 3), in their unit."""
     return (points.amax(0) + points.amin(0)) / 2
 
 
