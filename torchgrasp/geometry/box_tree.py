@@ -9,7 +9,7 @@ LEAF = 32  # most points in a leaf: a loop tries them faster than it opens furth
 
 
 class Boxes(NamedTuple):
-    """A tree of boxes around points, in which nearest points are sought.
+    """A balanced tree of boxes around points of any unit, in which nearest points are sought.
 
     Box 1 is the root, and box i holds boxes 2 i and 2 i + 1. There is no box 0. The last l boxes
     are leaves, which hold s points each.
@@ -23,7 +23,11 @@ class Boxes(NamedTuple):
 
 
 def sort_into_boxes(points: np.ndarray) -> Boxes:
-    """Return points (n, 3) in a tree of boxes, each of which is halved across its longest side."""
+    """Return a tree of boxes around points (n, 3), in which nearest points are sought.
+
+    Each box is halved across its longest side, so that its halves hold equally many points. A leaf
+    holds at most 32 points (`LEAF`).
+    """
     leaves = 2 ** max(math.ceil(math.log2(len(points) / LEAF)), 0)
     missing = -len(points) % leaves
     # NaN comes last, and is neither the least nor the greatest of several

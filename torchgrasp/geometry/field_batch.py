@@ -23,8 +23,8 @@ class FieldBatch(DistanceField):
     """The distance fields of c objects, joined, so that a batch of points can have a field for each
     entry.
 
-    Points given to a method have the shape (r, ..., 3). The points of entry r of axis 0 belong to
-    the field with the index `owner[r]`.
+    The batch has r entries. Points given to a method have the shape (r, ..., 3). The points of
+    entry i belong to the field with the index `owner[i]`. They are in the frame of its object.
     """
 
     # signed distances [m] at all nodes of all c fields, one field after another
@@ -38,7 +38,7 @@ class FieldBatch(DistanceField):
 
     @classmethod
     def of(cls, fields: Sequence[SignedDistanceField]) -> "FieldBatch":
-        """Return c fields joined to a batch of c entries, where entry k has field k."""
+        """Return c distance fields joined to a batch of c entries, where entry i has field i."""
         nodes = torch.cat([x.nodes for x in fields])
         shape = torch.tensor([x.values.shape for x in fields], device="cpu")
         places = torch.stack(
@@ -53,7 +53,7 @@ class FieldBatch(DistanceField):
 
     @property
     def spacing(self) -> Float[Tensor, "r"]:
-        """The spacing [m] of the nodes of each entry's field."""
+        """The distance (r,) [m] between neighbouring nodes of each entry's field."""
         return self._own[0][:, 3]
 
     def rows(self, index: Int[Tensor, "k"]) -> "FieldBatch":

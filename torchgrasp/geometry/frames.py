@@ -26,7 +26,9 @@ direction of the virtual frame.
 def rigid(
     rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 4 4"]:
-    """Return the homogeneous 4 x 4 transform with a given rotation and translation [m]."""
+    """Return the homogeneous transforms (*b, 4, 4) with given rotation matrices and translations
+    [m].
+    """
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = eye_like(4, top)[3]
     return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
@@ -35,8 +37,10 @@ def rigid(
 def turned_about(
     rotation: Float[Tensor, "*b 3 3"], point: Float[Tensor, "3"], shift: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 4 4"]:
-    """Return the rigid transform that rotates about a point (3,) [m], and then translates by
-    `shift` [m].
+    """Return the transform that rotates about a `point` (3,) [m], and then translates by `shift`
+    [m].
+
+    The `rotation` (*b, 3, 3) is a matrix, and the result is rigid. b stands for any batch axes.
     """
     return rigid(rotation, point + shift - rotation @ point)
 
@@ -50,14 +54,14 @@ def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
 def apply(
     a_from_b: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b n 3"]
 ) -> Float[Tensor, "*#b n 3"]:
-    """Map points [m] from frame b to frame a by the rigid transform `a_from_b`."""
+    """Return points (*b, n, 3) [m] of frame b in frame a, by the rigid transform `a_from_b`."""
     return points @ a_from_b[..., :3, :3].mT + a_from_b[..., None, :3, 3]
 
 
 def rotate(
     a_from_b: Float[Tensor, "*#b 4 4"], directions: Float[Tensor, "*#b n 3"]
 ) -> Float[Tensor, "*#b n 3"]:
-    """Rotate directions (vectors of any unit) from frame b to frame a.
+    """Return directions (*b, n, 3), vectors of any unit, of frame b in frame a.
 
     The translation of the rigid transform `a_from_b` is ignored.
     """
@@ -73,9 +77,9 @@ def skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return the rotation matrix by the angle |v| [rad] about the axis v, the exponential map.
+    """Return the rotation matrix (*b, 3, 3) of a rotation vector v: by the angle |v| [rad] about v.
 
-    It is smooth at v = 0.
+    This is the exponential map, which is smooth at v = 0. b stands for any batch axes.
     """
     angle = norm(v)[..., None, None]
     # Rodrigues: sin x / x, and (1 - cos x) / x^2 = half^2 / 2
@@ -95,7 +99,7 @@ def real(numbers: Any) -> Tensor:
 def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
     """Return the rotation matrix of `rpy`: roll, pitch and yaw [rad] about the fixed axes x, y, z.
 
-    This is the order of a URDF.
+    The rotation about x comes first, as in a URDF.
     """
     cr, cp, cy = map(math.cos, rpy)
     sr, sp, sy = map(math.sin, rpy)
@@ -108,16 +112,17 @@ def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return the angles [rad] of rotation matrices, from 0 to pi, accurate near both ends."""
+    """Return the angles (*b,) [rad] of rotation matrices, from 0 to pi, accurate near both ends."""
     axis = (rotation - rotation.mT)[..., [2, 0, 1], [1, 2, 0]]
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
     return torch.atan2(norm(axis), trace - 1)
 
 
 def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
-    """Return all subsets of s = `size` indices out of 0 to `count` - 1, on a `device`.
+    """Return all k subsets of the indices 0 to `count` - 1 that have s = `size` members.
 
-    Each line of the result is one subset, in ascending order; the k lines are in lexical order.
+    Each line of the result (k, s) is one subset, in ascending order. The lines are in lexical
+    order, on the `device`.
     """
     if size == count:
         return torch.arange(count, device=device)[None]
@@ -125,7 +130,7 @@ def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
 
 
 def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
-    """Return a mask of the contact sets whose f contacts lie nearly on a line.
+    """Return a mask (*b,) of the contact sets whose f contact points lie nearly on a line.
 
     Then twice the area of their largest triangle is at most 0.001 (`FLAT`) times the square of the
     longest side. The points [m] may be in any frame.
@@ -141,10 +146,10 @@ def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
 def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
     """Return the pose `a_from_vf` [m] of the virtual frame of three contacts [m] in frame a.
 
-    Eqs. (15)-(17) of the paper define it. The origin is the centroid of the contacts (Eq. 16). The
-    x axis points from the first contact to the third. The z axis is the normal of their plane.
-    Raises `DegenerateContacts` for contacts nearly on a line. Inside torch.vmap, where values are
-    unknown, their pose is NaN instead.
+    Eqs. (15)-(17) of the paper define it. The origin is the centroid of the contact points p1, p2,
+    p3 (Eq. 16). The x axis points from p1 to p3. The z axis is along (p2 - p1) x (p3 - p1), normal
+    to their plane. Raises `DegenerateContacts` for contacts nearly on a line. Inside torch.vmap,
+    where values are unknown, their pose is NaN instead.
     """
     flat = degenerate(points)
     if not is_known(flat):

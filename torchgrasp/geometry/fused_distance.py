@@ -24,10 +24,14 @@ def distance(
     surface: "MeshSurface",
     tried: int,
 ) -> np.ndarray:
-    """Return the signed distances (n,) [m] of points (n, 3) [m] from a surface, positive outside.
+    """Return the signed distances (n,) [m] of points (n, 3) [m] from a mesh, positive outside.
 
-    Each is the distance from the nearest of some triangles: those of the `tried` nearest `samples`
-    of the `surface`.
+    Args:
+        points: the points, in the frame of the mesh.
+        samples: sample points of the surface, each with the index of its triangle.
+        surface: the triangles of the mesh, and the normals that give the sign.
+        tried: number of samples nearest to a point, whose triangles are tried. The distance is that
+            from the nearest of these triangles.
     """
     found = np.empty(len(points))
     points = np.ascontiguousarray(points, dtype=np.float64)

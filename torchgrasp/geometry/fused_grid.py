@@ -18,7 +18,7 @@ from torchgrasp.geometry.fused_vectors import dot, put, scale
 class LookedUp(NamedTuple):
     """A grid of signed distances, negative inside an object, as NumPy arrays for compiled loops.
 
-    It is what `query` interpolates in. n counts the nodes of the grid.
+    The function `query` interpolates between its nodes, of which there are n.
     """
 
     values: np.ndarray  # signed distances (n,) [m] at the nodes, those along z adjacent
@@ -34,8 +34,8 @@ def query(
     """Return (distance, gradient) at points (*b, 3) [m], interpolated between the nodes of a grid.
 
     `distance` (*b,) is the signed distance [m], and `gradient` (*b, 3) its derivative with respect
-    to the point (no unit). Outside the grid, the distance [m] from the grid is added to the value
-    at the border.
+    to the point (no unit). Points are in the frame of the grid; b stands for any batch axes.
+    Outside the grid, the distance [m] from the grid is added to the value at the border.
     """
     distance = points.new_empty(points.shape[:-1])
     gradient = points.new_empty(points.shape)
@@ -75,8 +75,9 @@ def _lerp(a, b, share):
 def look_up(part, p):
     """Return (distance, gradient) at a point `p` [m], interpolated in a grid of signed distances.
 
-    The signed distance is in metres; the gradient is a tuple of three numbers without unit. `part`
-    is the grid, with the fields of `LookedUp`.
+    The signed distance is in metres, negative inside the object. The gradient is its derivative
+    with respect to the point, a tuple of three numbers without unit. `part` is the grid, with the
+    fields of `LookedUp`.
     """
     x = cell_of(part, p, 0)
     y = cell_of(part, p, 1)

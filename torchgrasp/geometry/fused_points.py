@@ -8,11 +8,10 @@ from torchgrasp.geometry.fused_vectors import dot, insert, minus
 
 
 def nearest(points: np.ndarray, boxes: Boxes, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance (n,) and index (n,) of the point in `boxes` that is nearest to each of the
-    points (n, 3).
+    """Return (distance, index) of the point in `boxes` that is nearest to each of n points (n, 3).
 
-    The index is that in the array from which `boxes` was made. Where no point is nearer than
-    `limit`, distance and index are infinity and 0.
+    The distance (n,) is in the points' unit. The index (n,) is that in the array from which `boxes`
+    was made. Where no point is nearer than `limit`, distance and index are infinity and 0.
     """
     distance = np.empty(len(points))
     index = np.empty(len(points), np.int64)
@@ -22,10 +21,10 @@ def nearest(points: np.ndarray, boxes: Boxes, limit: float) -> tuple[np.ndarray,
 
 
 def farthest(points: np.ndarray, count: int, first: int, tie: float) -> np.ndarray:
-    """Return the indices of `count` points (n, d), each the farthest from all points before it.
+    """Return the indices of `count` of n points (n, d), each the farthest from all those before it.
 
     The choice begins with the point of the index `first`. Points whose squared distances differ by
-    at most the share `tie` count as equally far; the first of them is taken.
+    at most the share `tie` count as equally far. The first of them is taken.
     """
     picks = np.full(count, first)
     _put_farthest(np.ascontiguousarray(points), tie, picks)
@@ -46,8 +45,8 @@ def _squared_gap(point, low, high):
 def find_nearest(point, boxes, stack, kept, nearest):
     """Write the indices of the points in `boxes` that are nearest to a `point` into `nearest`.
 
-    An index counts the points of all leaves, leaf by leaf. As many are found as `nearest` has
-    places.
+    An index counts the points of all leaves, leaf by leaf, and not those of the array that was
+    sorted. As many points are found as `nearest` has entries.
 
     Args:
         point: the point, three numbers.
@@ -55,7 +54,8 @@ def find_nearest(point, boxes, stack, kept, nearest):
         stack: integers, the memory for the search.
         kept: squared distances, ascending, up to which points are taken; those of the found points
             replace them.
-        nearest: indices that belong to `kept`.
+        nearest: indices of the found points, in the order of `kept`. Where fewer are within `kept`,
+            entries stay as they were.
     """
     low, high, samples = boxes
     leaves, size, _ = samples.shape

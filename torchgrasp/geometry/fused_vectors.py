@@ -42,7 +42,9 @@ def put(row, v):
 
 @inlined
 def copy(to, values):
-    """Write the array `values` into `to`, of the same shape; an assignment compiles for seconds."""
+    """Write the array `values` into the array `to` of the same shape. Numba would take seconds to
+    compile an assignment.
+    """
     for k in range(values.size):
         to.flat[k] = values.flat[k]
 

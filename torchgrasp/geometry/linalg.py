@@ -27,8 +27,8 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # golden section of the full circle
 
 
 def norm(v: Float[Tensor, "*b d"], keepdim: bool = False) -> Float[Tensor, "*c"]:
-    """Return the Euclidean lengths of vectors along the last axis; `keepdim` keeps this axis with
-    size 1.
+    """Return the Euclidean lengths of vectors along the last axis, in the unit of the vectors.
+    `keepdim` keeps this axis with size 1.
     """
     return torch.linalg.vector_norm(v, dim=-1, keepdim=keepdim)
 
@@ -48,14 +48,16 @@ def check_unit_vectors(name: str, vectors: Float[Tensor, "*b d"]) -> None:
 def dot(
     a: Float[Tensor, "*b d"], b: Float[Tensor, "*c d"], keepdim: bool = False
 ) -> Float[Tensor, "*e"]:
-    """Return the dot products of vectors along the last axis; `keepdim` keeps this axis with size
-    1.
+    """Return the dot products of vectors along the last axis. Other axes broadcast; `keepdim` keeps
+    the last axis with size 1.
     """
     return (a * b).sum(-1, keepdim=keepdim)
 
 
 def matvec(matrix: Float[Tensor, "*b m n"], v: Float[Tensor, "*c n"]) -> Float[Tensor, "*e m"]:
-    """Return the products of matrices (m, n) and vectors `v` (n,)."""
+    """Return the products (m,) of matrices (m, n) and vectors `v` (n,). Leading batch axes
+    broadcast.
+    """
     return (matrix @ v[..., None])[..., 0]
 
 
@@ -85,7 +87,9 @@ def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
 
 
 def perpendicular(v: Float[Tensor, "*b 3"], axis: Float[Tensor, "*c 3"]) -> Float[Tensor, "*d 3"]:
-    """Return the parts of vectors `v` that are perpendicular to unit vectors `axis`."""
+    """Return the components of vectors `v` that are perpendicular to unit vectors `axis`. Batch
+    axes broadcast.
+    """
     return v - dot(v, axis, keepdim=True) * axis
 
 
@@ -110,7 +114,7 @@ def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 def number_rows(rows: Shaped[Tensor, "n d"]) -> Int[Tensor, "n"]:
-    """Return the index (n,) of each of n rows in the sorted list of distinct rows.
+    """Return the index (n,) of each of n rows in the list of distinct rows, in lexical order.
 
     `torch.unique` of whole rows takes much longer than that of one column after the other.
     """
@@ -141,7 +145,7 @@ def number_cells(places: Float[Tensor, "n d"], side: float) -> Int[Tensor, "n"]:
 def fibonacci_sphere(
     n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5
 ) -> Float[Tensor, "n 3"]:
-    """Return n unit vectors spread evenly over the sphere, from +z to -z.
+    """Return n unit vectors (n, 3) that a spiral spreads evenly over the sphere, from +z to -z.
 
     Vector k has the azimuth `angle` * (k + `start`) [rad].
     """
@@ -153,8 +157,8 @@ def fibonacci_sphere(
 
 
 def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"]:
-    """Return vectors (..., d) shortened to the length `longest` where they are longer, in their own
-    unit.
+    """Return vectors (*b, d), shortened to the length `longest` (in their own unit) where they are
+    longer.
     """
     # a zero vector has no second derivative of its length, which does not count here
     moving = torch.where((v == 0).all(-1, keepdim=True), v.detach(), v)
@@ -208,7 +212,8 @@ def farthest_points(
     distance: Callable[[Tensor, Tensor], Tensor] | None = None,
     before: Float[Tensor, "m *d"] | None = None,
 ) -> Int[Tensor, "picks"]:
-    """Return the indices of at most `count` points, each the farthest from all points before it.
+    """Return the indices of `count` points, or of all if fewer, each the farthest from those before
+    it.
 
     The choice begins with the point of the index `first`. Points whose distances differ by at most
     the share `tie` count as equally far; the first of them is taken. Points in `before` count as
@@ -246,7 +251,7 @@ def farthest_points(
 def reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
     """Return points mirrored across planes n . x = o, given as vectors (n, o).
 
-    n is a unit normal (3), and o the offset in the unit of the points.
+    n is a unit normal (3), and o the offset in the unit of the points. Batch axes broadcast.
     """
     height = (points * plane[..., :3]).sum(-1, keepdim=True) - plane[..., 3:]
     return points - 2.0 * height * plane[..., :3]
@@ -257,6 +262,6 @@ def reflect_directions(
 ) -> Float[Tensor, "*d 3"]:
     """Return directions mirrored across planes n . x = o, given as vectors (n, o).
 
-    n is a unit normal (3); the offset o is not used.
+    n is a unit normal (3); the offset o is not used. Batch axes broadcast.
     """
     return directions - 2.0 * (directions * plane[..., :3]).sum(-1, keepdim=True) * plane[..., :3]

@@ -41,7 +41,7 @@ STL_FACE = 50
 
 
 def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
-    """Return a closed triangle mesh [m], read from a file or given, after checks.
+    """Return a checked closed triangle mesh [m], which is given or read from a file.
 
     A bad mesh is never repaired.
 
@@ -49,7 +49,8 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
         MeshError: the file is no .obj, .off, .ply or .stl file, or has more than 50 MiB.
         MeshError: the mesh has no faces, or more than 500,000.
         MeshError: the mesh has vertices that are not finite, an open surface, or no volume.
-        MeshError: the faces are not all turned outward, or many lie on each other.
+        MeshError: the faces are not all turned outward, or over 1 % of the surface lies on other
+            faces.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the
             unit is mm.
     """
@@ -85,9 +86,11 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
 
 
 def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
-    """Raise `MeshError` unless a mesh [m] encloses a volume, with all faces turned outward.
+    """Raise `MeshError` unless a mesh [m] is closed and encloses a volume, with all faces turned
+    outward.
 
-    The message calls the mesh `name`.
+    It must have one to 500,000 faces (`MESH_FACES`), and finite vertices. Faces of a cavity are
+    turned into it. The message calls the mesh `name`.
     """
     if not 0 < len(mesh.faces) <= MESH_FACES:
         allowed = f"a closed mesh of at most {MESH_FACES} triangles"
@@ -175,8 +178,8 @@ def closest_on_triangles(
     lies.
 
     The `points` (n, 3) and the corners of the `triangles` (n, 3 corners, 3) have the same unit. The
-    feature (n,) is 0 inside the face. On the sides ab, bc, ca it is 1 to 3. At the corners a, b, c
-    it is 4 to 6.
+    feature (n,) is 0 inside the face. On the sides ab, bc, ca it is 1 to 3. At the corners a, b, c,
+    in the order given, it is 4 to 6.
     """
     a = triangles[:, 0]
     u = triangles[:, 1] - triangles[:, 0]
@@ -212,8 +215,10 @@ def clip_mesh(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (vertices, faces, on_cut): the part of a mesh where a scalar field is negative.
 
-    `on_cut` is a mask of the returned vertices that lie on the cut. `values` (v,) is the field at
-    the `vertices` (v, 3); it is linear within each of the `faces` (f, 3).
+    The returned vertices (w, 3) and faces (g, 3) are as the given ones. `on_cut` (w,) is a mask of
+    the vertices that lie on the cut, where the field is 0. `values` (v,) is the field at the
+    `vertices` (v, 3), of any unit. It is linear within each of the `faces` (f, 3), which hold
+    indices of vertices.
     """
     keep = values < 0
     count = keep[faces].sum(1)
@@ -249,11 +254,11 @@ def clip_mesh(
 
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
-    """Return what `trimesh.load_mesh` reads from `data`, the bytes of a file with the given
-    `suffix`.
+    """Return what `trimesh.load_mesh` reads from the bytes of a mesh file: most often one mesh.
 
-    `options` go to `trimesh.load_mesh`. Raises `Malformed` for more than 500,000 faces
-    (`MESH_FACES`). For bad bytes, trimesh may raise any exception.
+    `data` are the bytes, and `suffix` is the file's, such as ".obj". `options` go to
+    `trimesh.load_mesh`. Raises `Malformed` for more than 500,000 faces (`MESH_FACES`). For bad
+    bytes, trimesh may raise any exception.
     """
     data = _geometry(data) if suffix == ".obj" else data
     if (faces := _count_faces(data, suffix)) > MESH_FACES:

@@ -1,5 +1,5 @@
-"""Exact signed distances to a triangle mesh, which may be open. They are to the nearest of a few
-triangles that samples of the surface tell.
+"""Exact signed distances to a triangle mesh, which may be open. Samples of the surface propose a
+few triangles; the distance is that to the nearest of them.
 """
 
 import dataclasses
@@ -51,13 +51,15 @@ def surface_distance(vertices: Tensor, faces: Tensor) -> Callable[[np.ndarray], 
     a mesh.
 
     The mesh has outward faces: `vertices` (v, 3) [m], and `faces` (f, 3), the indices of three
-    vertices each.
+    vertices each. The points are in the frame of the mesh. Raises `BadArgument` for an index out of
+    range, or if no face has an area.
     """
     return MeshSurface(vertices, faces).distance
 
 
 class MeshSurface:
-    """The triangles of a mesh [m], with samples of the surface, to find distances to it.
+    """The triangles of a mesh [m], with samples of its surface, to find the distances of points
+    from it.
 
     It is made of the `vertices` (v, 3) and `faces` (f, 3), the indices of three vertices each.
     Raises `BadArgument` for an index out of range, or if no face has an area.
@@ -95,7 +97,7 @@ class MeshSurface:
 
     @cached_property
     def every(self) -> "Samples":
-        """All samples of the surface."""
+        """All samples of the surface, in which the nearest to a point are sought."""
         return Samples(self.samples, self.owner)
 
     @cached_property
@@ -107,7 +109,8 @@ class MeshSurface:
         """Return the signed distances (n,) [m] of points (n, 3) [m] from the mesh, positive
         outside.
 
-        `far` uses fewer samples, for distant points.
+        The points are in the frame of the mesh. `far` is for distant points: one in 8 samples of
+        the surface is used, which is faster and less exact.
         """
         samples = self.few if far else self.every
         tried = 1 if far else min(MESH_DISTANCE.tried, len(self.owner))
@@ -133,7 +136,8 @@ class MeshSurface:
 
 
 class Samples:
-    """Sample points of a surface, by which the triangles nearest to a point are found.
+    """Sample points of a mesh's surface: the samples nearest to a point tell the triangles nearest
+    to it.
 
     Args:
         points: s points (s, 3) [m] on the surface.
@@ -146,12 +150,12 @@ class Samples:
 
     @cached_property
     def tree(self) -> Any:
-        """The search tree of the points."""
+        """The k-d tree (`scipy.spatial.KDTree`) of the sample points."""
         return spatial.KDTree(self.points, leafsize=MESH_DISTANCE.leaf)
 
     @cached_property
     def boxes(self) -> Boxes:
-        """The points in a tree of boxes, for compiled loops."""
+        """The sample points in a balanced tree of boxes, which compiled loops search."""
         return sort_into_boxes(self.points)
 
 

@@ -22,8 +22,9 @@ CHECK_EVERY = 6  # steps between two looks for ended problems on an accelerator:
 
 @dataclasses.dataclass(frozen=True)
 class Linearisation(Batch):
-    """The costs of the problems of a batch at their present states, a in number. Subclasses add
-    linear models: what a step needs, such as residuals and their Jacobian.
+    """Linear model of each minimisation problem of a batch at its present state, with its cost.
+
+    a counts the problems. Subclasses add what a step needs, such as residuals and their Jacobian.
     """
 
     cost: Float[Tensor, "a"]  # cost of each problem, which is minimised (no unit)
@@ -159,8 +160,9 @@ Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
 
 @dataclasses.dataclass(frozen=True)
 class LinearResiduals(Linearisation):
-    """The linear models of least-squares problems, a in number: m residuals of each, and their
-    Jacobian by its d variables.
+    """Linear model of each least-squares problem of a batch: residuals, and their Jacobian.
+
+    a counts the problems, m the residuals of each, and d its variables.
     """
 
     # the m residuals of each problem; its cost is the sum of their squares
@@ -194,10 +196,11 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
     stalled: float = 0.02  # relative decrease of the cost below which a problem has converged
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearResiduals:
-        """Return the residuals, their Jacobian and the sum of their squares for the problems with
-        the indices `rows` (a,).
+        """Return the residuals of some problems, their Jacobian, and as cost the sum of their
+        squares.
 
-        `state` holds the states of these problems.
+        `state` holds the states of these problems, and `rows` (a,) their indices among all
+        problems.
         """
         residual, jacobian = self.residuals(state, rows)
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
@@ -207,8 +210,9 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         on.
 
         `model` holds the residuals and their Jacobian, and `damping` (a,) the damping of each
-        problem's step. The step of a problem with a singular matrix is zero. A problem ends if its
-        cost is below `solved`, or its damping is infinite.
+        problem's step. A step whose largest change of a variable exceeds `largest` is shortened to
+        it. The step of a problem with a singular matrix is zero. A problem ends if its cost is
+        below `solved`, or its damping is infinite.
         """
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
@@ -231,11 +235,12 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
     def judge(
         self, model: LinearResiduals, trial: LinearResiduals, x: Step, damping: Damping
     ) -> Verdict:
-        """Return a mask (a,) of the accepted steps, those that lower the cost, and the damping (a,)
-        of the next steps.
+        """Return a mask (a,) of the accepted steps, which lower the cost, and the damping (a,) of
+        the next ones.
 
-        An accepted step divides the damping by `fall`, a rejected one multiplies it by `rise`. The
-        damping is infinite for a problem that has converged or is stuck, which ends it.
+        An accepted step divides the damping by `fall`, a rejected one multiplies it by `rise`. An
+        infinite damping ends a problem. So ends a problem whose accepted step lowers the cost by
+        less than the share `stalled`. So does one whose step is rejected at a damping above `lost`.
 
         Args:
             model: residuals and costs of the problems before the steps.

@@ -39,7 +39,7 @@ MOST_ABOVE = 0.01
 @dataclasses.dataclass(frozen=True)
 class Plane(Value):
     """The plane of a table: the points p [m] with normal . p = offset. The normal points up, to the
-    objects.
+    objects. All vectors are in one frame, such as that of a cloud.
 
     A table with an `edge` ends there. It fills the points below its own plane and behind the plane
     of the edge. Fingers may then reach under what lies over the edge.
@@ -86,7 +86,7 @@ class Plane(Value):
     def height(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the heights (*b,) [m] of points (*b, 3) [m] above the plane, negative below it.
 
-        b stands for any batch axes.
+        The points are in the frame of the plane. b stands for any batch axes.
         """
         return points @ self.normal.to(points) - self.offset
 
@@ -95,11 +95,12 @@ class Plane(Value):
         """Return the same table with a straight `edge`, beyond which there is no table.
 
         Args:
-            point: any point (3,) [m] on the edge.
+            point: any point (3,) [m] on the edge, in the frame of the plane.
             outward: direction (3,) away from the table, of any length. Its part along the table
                 counts.
 
-        Raises `BadArgument` for a direction that is all but vertical.
+        Raises `BadArgument` for a direction less than 3 degrees from the table's normal
+        (`LEAST_TILT`).
 
         >>> table = Plane.horizontal(0.0).ending(torch.tensor([0.3, 0, 0]), torch.tensor([1.0, 0, 0]))
         >>> table.clearance(torch.tensor([[0.2, 0.0, -0.1], [0.35, 0.0, -0.1]]))
@@ -117,9 +118,10 @@ class Plane(Value):
     def clearance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return lower bounds (*b,) [m] of the distances of points (*b, 3) [m] from the table.
 
-        Without an edge they are the heights. With one they are the larger of the height and of the
-        distance beyond the edge. They are negative exactly inside the table. Here b stands for any
-        batch axes.
+        A point of a table without an edge has its height as bound. With an edge, the bound is the
+        larger of the height and of the distance beyond the edge. Bounds are negative for points
+        inside the table, and only for them. The points are in the frame of the plane. Here b stands
+        for any batch axes.
         """
         height = self.height(points)
         return height if self.edge is None else torch.maximum(height, self.edge.height(points))
@@ -147,9 +149,11 @@ class Plane(Value):
 
 
 def read_plane(text: str) -> Plane:
-    """Return the plane that a text of `Plane.describe` describes.
+    """Return the plane that a text describes, such as "normal 0 0 1, offset 0.1"
+    (`Plane.describe`).
 
-    Raises `BadArgument` for any other text.
+    The offset is in metres, and the plane is in float64. Raises `BadArgument` if the text lacks
+    these numbers, or the normal is not of unit length.
     """
     own, *edges = text.split("; edge ")
     words = own.replace(",", "").split()
@@ -163,10 +167,10 @@ def read_plane(text: str) -> Plane:
 
 
 def as_plane(table: Plane | float | None) -> Plane | None:
-    """Return a table as a plane, given as a plane or as its height [m] along z; None means no
-    table.
+    """Return the `Plane` of a table, which is given as such, or as its height [m] along z.
 
-    Raises `BadArgument` for another type or a height that is not finite.
+    None means no table, and is returned. Raises `BadArgument` for another type or a height that is
+    not finite.
     """
     if table is None or isinstance(table, Plane):
         return table
@@ -176,8 +180,10 @@ def as_plane(table: Plane | float | None) -> Plane | None:
 
 
 def faces_of(table: Plane | None) -> tuple[Plane, ...]:
-    """Return the planes at which a table ends: its top and, with an edge, its side; none without a
-    table.
+    """Return the planes that bound a table: its top and, with an edge, the vertical plane through
+    it.
+
+    None means no table, and gives an empty tuple.
     """
     if table is None:
         return ()
@@ -189,15 +195,17 @@ def upright_frame(
     viewpoint: Float[Tensor, "*v 3"] | None = None,
     table: Plane | None = None,
 ) -> Float[Tensor, "4 4"]:
-    """Return `obj_from_upright`, the pose [m] of a frame that is fixed to points, camera and table.
+    """Return `obj_from_upright`, the pose [m] of an upright frame that points, camera and table
+    define.
 
-    The z axis is the table's normal. Without a table, z points to the camera; without both, z is
+    All arguments and the pose are in one frame `obj`. The upright frame moves with the arguments.
+    Its z axis is the table's normal. Without a table, z points to the camera; without both, z is
     the direction in which the points spread least. The x axis is horizontal and points towards the
     camera. If the camera is straight above, x points to the point farthest from the vertical
     through the points' centroid. The origin is on this vertical, on the table if there is one.
     `viewpoint` [m] is the camera's position, or several, whose mean is taken. Raises `BadArgument`
-    for a table above most points or above a camera. Raises it also for one more than 2 m
-    (`MAX_EXTENT`) below the highest point.
+    for a table above a camera, or more than 10 mm (`MOST_ABOVE`) above most points. Raises it also
+    for one more than 2 m (`MAX_EXTENT`) below the highest point.
     """
     points = points.detach().cpu().double()
     centre = points.mean(0)
@@ -252,11 +260,11 @@ def _check_under(
 def upright_table(
     table: Plane | None, obj_from_upright: Float[Tensor, "4 4"]
 ) -> Plane | float | None:
-    """Return a table in its upright frame: the height 0, or with an edge a plane; None without a
-    table.
+    """Return a table in the upright frame: its height 0 or, if it has an edge, a plane.
 
-    `obj_from_upright` is the frame's pose, as `upright_frame` returns it with this table. The
-    numbers of an edge are rounded to multiples of 2^-20 (`GRID`), in metres or without unit.
+    None means no table, and is returned. The given table is in the frame `obj` of the points.
+    `obj_from_upright` is the pose [m] that `upright_frame` returned with this table. The numbers of
+    an edge are rounded to multiples of 2^-20 (`GRID`), in metres or without unit.
     """
     if table is None or table.edge is None:
         return None if table is None else 0.0
@@ -270,10 +278,11 @@ def upright_table(
 def to_upright(
     points: Float[Tensor, "*b 3"], obj_from_upright: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "*b 3"]:
-    """Return points [m] in the upright frame, rounded to multiples of 2^-20 m (`GRID`), a
-    micrometre.
+    """Return points (*b, 3) [m] of the frame `obj` in the upright frame, in float64.
 
-    `obj_from_upright` (4, 4) is the frame's pose [m], as `upright_frame` returns it.
+    They are rounded to multiples of 2^-20 m (`GRID`), a micrometre. `obj_from_upright` (4, 4) is
+    the pose [m] of the upright frame in `obj`, as `upright_frame` returns it. b stands for any
+    batch axes.
     """
     upright_from_obj = inverse(obj_from_upright).to(points.device)
     moved = apply(upright_from_obj, points.double().reshape(-1, 3))
@@ -281,10 +290,10 @@ def to_upright(
 
 
 def round_upright(value: SomeValue, obj_from_upright: Float[Tensor, "4 4"]) -> SomeValue:
-    """Return a value, such as a cloud, in the upright frame, in float64 and rounded.
+    """Return a copy of a value, such as a cloud, in the upright frame, in float64 and rounded.
 
     Every number of its tensors is rounded to a multiple of 2^-20 (`GRID`), in its own unit.
-    `obj_from_upright` (4, 4) is the frame's pose [m] in the frame of the value.
+    `obj_from_upright` (4, 4) is the upright frame's pose [m] in the present frame of the value.
     """
     return map_tensors(_round, move(value.to(torch.float64), inverse(obj_from_upright)))
 
@@ -297,12 +306,12 @@ def _round(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 
 
 def move(value: SomeValue, b_from_a: Float[Tensor, "4 4"]) -> SomeValue:
-    """Return a value, such as a cloud or grasps, transformed from frame a to frame b, with lengths
-    in metres.
+    """Return a copy of a value, such as a cloud or grasps, transformed from frame a to frame b.
 
-    `b_from_a` (4, 4) is the rigid transform. Fields of points, directions and poses change, also in
-    values within the value. Their names are in `POINTS`, `DIRECTIONS` and `POSES`; other fields
-    stay as they are.
+    `b_from_a` (4, 4) is the rigid transform [m]. Which fields change follows from their names, also
+    in values within the value. Points (`POINTS`, such as `vertices`) and poses (`POSES`, such as
+    `obj_from_hand`) are transformed. Directions (`DIRECTIONS`, such as `normals`) are rotated.
+    Other fields stay as they are.
     """
 
     def moved(name: str, x: Any) -> Any:

@@ -105,9 +105,11 @@ PLANES = PlaneNumbers()
 def assume_noise(
     points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None
 ) -> Float[Tensor, "n"]:
-    """Return the assumed depth noise [m] of each point [m], for a camera at `eye` [m].
+    """Return the assumed depth noise (n,) [m], a standard deviation, of points (n, 3) [m] of a
+    view.
 
-    The noise grows with the squared distance. None means an unknown camera, 0.7 m
+    The noise grows with the squared distance from the camera. `eye` (3,) [m] is its position in the
+    frame of the points. None means an unknown camera, which is taken to be 0.7 m
     (`PLANES.distance`) from each point.
     """
     if eye is None:
@@ -118,7 +120,8 @@ def assume_noise(
 
 
 class SeenPoints:
-    """The n points of one view in which planes are sought, in a frame with their mean as origin.
+    """The n points of one view, in which planes are sought. All vectors are in one frame, whose
+    origin is near the mean of the points.
 
     Args:
         points: the points (n, 3) [m].
@@ -143,7 +146,7 @@ class SeenPoints:
         self.noise = assume_noise(points, eye)
 
     def part(self, of: Bool[Tensor, "n"]) -> "SeenPoints":
-        """Return the view of the points in the mask `of` alone, in the same frame."""
+        """Return a view of only those points that are in the mask `of` (n,), in the same frame."""
         return SeenPoints(self.points[of], self.eye, self.sky, self.image_up)
 
 
@@ -151,7 +154,8 @@ class SeenPoints:
 class PlaneFit:
     """A plane normal . p = offset, fitted to many points p [m] of a view.
 
-    Noise is the distance of points from the plane, at one standard deviation.
+    It is in the frame of the view. Noise is the standard deviation of the points' distances from
+    the plane.
     """
 
     normal: Float[Tensor, "3"]  # unit normal (3,)
@@ -160,10 +164,11 @@ class PlaneFit:
     count: int  # number of points on the plane
 
     def turned_up(self, view: "SeenPoints") -> "PlaneFit":
-        """Return the plane with its normal turned to the upper side.
+        """Return the same plane, with its normal turned to the side that is up.
 
-        `view` holds all points of the view. If their upward direction is unknown, the normal points
-        to the camera. If that is unknown too, it points to the side on which most points are. Each
+        `view` holds all points of the view, and what is known of its directions. The normal is
+        turned to the upward direction `view.sky`. If that is unknown, it is turned to the camera.
+        If the camera is unknown, too, it is turned to the side on which most points are. Then each
         point counts by its distance from the plane, at most by 0.3 m (`PLANES.reach`).
         """
         if view.sky is not None:
@@ -179,10 +184,11 @@ class PlaneFit:
 
 
 def fit_planes(view: SeenPoints, generator: torch.Generator) -> Iterator[PlaneFit]:
-    """Yield at most 8 planes (`PLANES.planes`), each the one with most of the points that no
-    earlier plane holds.
+    """Yield planes in a view, each the one with most of the points that no earlier plane holds.
 
-    `generator` draws the triples of points that propose planes.
+    At most 8 planes (`PLANES.planes`) are sought. One that goes aslant through two parallel levels
+    is replaced by both. The search ends when no plane holds 2.5 % of the points. `generator` draws
+    the triples of points that propose planes.
     """
     points = view.points[: PLANES.scored]
     noise = view.noise[: PLANES.scored]
@@ -279,7 +285,8 @@ def _common_normal(points: Points, normal: Vector) -> Vector:
 def plane_axes(normal: Vector, points: Points) -> Float[Tensor, "3 2"]:
     """Return two perpendicular unit vectors, the columns of (3, 2), in the plane of a unit normal.
 
-    They follow from the points (n, 3): if points and normal are rotated, so are they.
+    The points (n, 3) define the vectors. The first one points from their mean to their first point,
+    along the plane. If points and normal are rotated, the vectors rotate alike.
     """
     side = points[0] - points.mean(0)
     x = unit(side - (side @ normal) * normal)
@@ -335,8 +342,9 @@ def _held(
 def refine_plane(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) -> PlaneFit:
     """Return the plane near a given one that best fits the points of a view.
 
-    The given plane has the unit vector `normal` and the `offset` [m]. Least squares are iterated
-    with Tukey's weights, which change smoothly with the points.
+    The given plane has the unit vector `normal` and the `offset` [m] along it, in the frame of the
+    view. The normal of the result points to the same side. Least squares are iterated with Tukey's
+    weights, which change smoothly with the points.
     """
     points = view.points
     noise = view.noise

@@ -58,10 +58,11 @@ class Grid(NamedTuple):
 
 
 class DistanceField(Value, abc.ABC):
-    """Base class of signed distances [m] at the nodes of a grid, negative inside an object.
+    """Base class of fields of signed distances [m], at the nodes of a grid, negative inside an
+    object.
 
-    A field holds the grid of one object for all points. Or it holds r grids, and in a batch of r
-    entries each entry has its own.
+    Grid and points are in the frame of the object. A field holds the grid of one object for all
+    points. Or it holds r grids, and in a batch of r entries each entry has its own.
     """
 
     # Float[Tensor, "n"]: distances [m] at all nodes of all grids, those along z adjacent
@@ -70,7 +71,8 @@ class DistanceField(Value, abc.ABC):
 
     @abc.abstractmethod
     def rows(self, index: Int[Tensor, "k"]) -> "DistanceField":
-        """Return the field for k entries of a batch, with the indices `index` (k,), in this order.
+        """Return the field of k entries of the batch only, those with the indices `index` (k,), in
+        this order.
 
         The field of one object is the same for every entry, and is returned unchanged.
         """
@@ -139,8 +141,9 @@ class SignedDistanceField(DistanceField):
     """Signed distances [m] of one object at the nodes of a regular grid, negative inside the
     object.
 
-    `surface_field` makes it from an estimated shape. The grid is along the axes of the object's
-    frame. `query` returns distance and gradient at any points, interpolated between the nodes.
+    `surface_field` makes it from an estimated shape, and `field_from_surface` from a mesh. The grid
+    is along the axes of the object's frame. `query` returns distance and gradient at any points,
+    interpolated between the nodes.
 
     Args:
         origin: position (3,) [m] of node (0, 0, 0).
@@ -213,10 +216,11 @@ class SignedDistanceField(DistanceField):
 
 
 def corner_steps(dx: Int[Tensor, "*b"], dy: Int[Tensor, "*b"]) -> Int[Tensor, "8 *b"]:
-    """Return the index steps from the first corner of a grid cell to its eight corners.
+    """Return the steps (8, *b) in a grid's flattened values from a cell's first corner to its eight
+    corners.
 
-    `dx` and `dy` are the strides: the numbers of values between neighbours on the x and on the y
-    axis. The stride on the z axis is 1.
+    `dx` and `dy` (*b,) are the strides of the grids on x and y: the numbers of values between
+    neighbours. The stride on the z axis is 1.
     """
     corner = torch.arange(8, device=dx.device).view(-1, *[1] * dx.ndim)
     return corner // 4 * dx + corner // 2 % 2 * dy + corner % 2

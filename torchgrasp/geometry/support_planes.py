@@ -164,7 +164,7 @@ SUPPORTS = SupportNumbers()
 @dataclasses.dataclass(frozen=True)
 class SupportPlane:
     """A plane that objects stand on (a support), and its region: the convex hull of the points on
-    it.
+    it. Vectors are in the frame of these points.
     """
 
     plane: Plane  # the plane; the camera is above it
@@ -176,9 +176,11 @@ class SupportPlane:
     local: bool = False
 
     def covers(self, points: Float[Tensor, "*b 3"], margin: float = 0.0) -> Bool[Tensor, "*b"]:
-        """Return a mask of the points [m] over the region, or at most `margin` [m] beside it.
+        """Return a mask (*b,) of the points (*b, 3) [m] that are straight above or below the
+        region.
 
-        A negative margin shrinks the region.
+        Straight means along the plane's normal. Points at most `margin` [m] beside the region
+        count, too; a negative margin shrinks it. Here b stands for any batch axes.
         """
         if self.sides is None:
             return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
@@ -200,17 +202,17 @@ class SupportPlane:
 def bound(
     plane: Plane, points: Points, on: Bool[Tensor, "n"], eye: Vector | None
 ) -> SupportPlane | None:
-    """Return the support on a plane, with its region, or None if the points on it span no area.
+    """Return a plane as a support, with the region that it covers.
 
     Args:
         plane: the plane, with its normal to the upper side.
-        points: all points (n, 3) [m] of the view.
+        points: all points (n, 3) [m] of the view, in the frame of the plane.
         on: mask of the points that lie on the plane.
         eye: position (3,) [m] of the camera; None if unknown.
 
     The region is the convex hull of the largest connected group of the points on the plane. Another
     large group joins it if the camera sees almost nothing below the plane between the groups. Then
-    an object hides that area.
+    an object hides that area. Returns None if the points on the plane span no area.
     """
     if int(on.sum()) < 3:
         return None
@@ -255,7 +257,7 @@ def _crossed(
 
 @dataclasses.dataclass(frozen=True)
 class Hull:
-    """A convex polygon in a plane, with two coordinates in the plane: the convex hull of points."""
+    """A convex polygon in a plane, the convex hull of points with two coordinates (x, y) [m]."""
 
     corners: Float[Tensor, "k 2"]  # the k corners (x, y) of the polygon [m]
     # outward unit normal n (x, y) of each of s sides, and offset o [m]; points p within have n . p
@@ -264,7 +266,7 @@ class Hull:
 
     @classmethod
     def of(cls, points: Float[Tensor, "n 2"]) -> "Hull":
-        """Return the convex hull of points [m] in a plane.
+        """Return the convex hull of points (n, 2) [m] in a plane.
 
         If all points lie on a line, the hull contains no point.
         """
@@ -275,7 +277,8 @@ class Hull:
         return cls(points[torch.from_numpy(hull.vertices).long()], torch.from_numpy(hull.equations))
 
     def holds(self, points: Float[Tensor, "n 2"], margin: float = 0.0) -> Bool[Tensor, "n"]:
-        """Return a mask of the points [m] in the polygon, or at most `margin` [m] outside.
+        """Return a mask (n,) of the points (n, 2) [m] in the polygon, or at most `margin` [m]
+        outside.
 
         A negative margin shrinks the polygon.
         """
@@ -321,12 +324,13 @@ def _parts(
 
 
 def cross(plane: Plane, points: Points, eye: Vector | None) -> tuple[Points, Bool[Tensor, "n"]]:
-    """Return where the camera rays through points cross a plane [m], and a mask of the points
-    behind it.
+    """Return (crossing, behind): where camera rays cross a plane, and which points are below it.
 
-    `points` (n, 3) and the camera's position `eye` (3,) are in metres. Without a camera, `eye`
-    None, the points themselves are returned. Then points more than 0.3 m (`PLANES.reach`) below the
-    plane do not count as behind it.
+    `crossing` (n, 3) [m] are the points in which the rays through the `points` (n, 3) [m] cross the
+    plane. `behind` (n,) is a mask of the points below the plane. The camera is above the plane, at
+    `eye` (3,) [m]. If `eye` is None, the points themselves are returned as `crossing`. Then points
+    more than 0.3 m (`PLANES.reach`) below the plane do not count as behind it. All arguments are in
+    one frame.
     """
     height = plane.height(points)
     if eye is None:

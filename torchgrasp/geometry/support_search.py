@@ -31,16 +31,19 @@ SUPPORT = "a plane with objects on it and nothing seen through it, or a table th
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """An object that is to be grasped, whose support is sought: some of its points."""
+    """An object that is to be grasped, and whose support (the plane under it) is sought: some of
+    its points.
+    """
 
     points: Points  # points (n, 3) [m] of the object
 
     def stands_on(self, support: SupportPlane) -> bool:
         """Return whether the object is over the region of a support, with its foot near the plane.
 
-        More than half of its points are then over the region. Its foot, above which 98 % of its
-        points are, is near the plane. It is less than 0.15 m (`SUPPORTS.afloat`) above the plane,
-        or 30 mm (`SUPPORTS.foot`) below it.
+        More than half of its points must be over the region, or at most 50 mm (`SUPPORTS.overhang`)
+        beside it. Its foot is the height above which 98 % of its points are. The foot must be less
+        than 0.15 m (`SUPPORTS.afloat`) above the plane, or less than 30 mm (`SUPPORTS.foot`) below
+        it. The support is in the frame of the points.
         """
         height = support.plane.height(self.points)
         foot = float(height.quantile(SUPPORTS.outliers))
@@ -56,19 +59,21 @@ def find_table(
     target: Target | None = None,
     image_up: Vector | None = None,
 ) -> tuple[SupportPlane, ...]:
-    """Return the support on a given table, or all supports found in the points, the most plausible
+    """Return the support that a given table is, or the supports found in a view, the most plausible
     first.
 
     Args:
-        points: (n, 3) [m].
+        points: the points (n, 3) [m] of the view; all arguments are in their frame.
         viewpoint: position (3,) [m] of the camera.
         table: the table as a plane, or its height [m] along z; None to search for supports.
         up: upward direction, three numbers of any length; None if unknown.
         target: the object to grasp; None if unknown. Supports on which it stands come first.
-        image_up: upward direction (3,) of the camera's image, as for `find_supports`.
+        image_up: direction (3,) that points up in the camera's image; None if unknown.
 
-    Raises `BadArgument` for a camera below the table, or a table with an edge. Raises it also for
-    `up` more than 60 degrees from the table's normal. Raises `NoSupport` if no support is found.
+    A support has the region that the points on it cover. The region of a given table is unbounded
+    if they cover none. Raises `BadArgument` for a camera below the table, or a table with an edge.
+    Raises it also for `up` more than 60 degrees from the table's normal. Raises `NoSupport` if no
+    support is found.
     """
     plane = as_plane(table)
     if plane is not None and plane.edge is not None:
@@ -161,21 +166,21 @@ def find_supports(
     """Return the planes that support objects in a view, the most plausible first.
 
     Args:
-        points: (n, 3) [m].
+        points: the points (n, 3) [m] of the view; all arguments are in their frame.
         viewpoint: position (3,) [m] of the camera; None if unknown: then the side with more points
             is the upper one.
         up: upward direction (3,) of any length; None allows any direction.
         least_width: least width [m] of a support's region.
-        image_up: upward direction (3,) of the camera's image; None if unknown.
+        image_up: direction (3,) that points up in the camera's image; None if unknown.
 
     Triples of points propose planes. An iterated fit with Tukey's weights refines each plane.
     Objects stand on a support, over its region, and the camera sees nothing through the region. The
-    support with the most points low above it comes first. The points count twice if the camera
-    looks at the support, and half if it is bowed. They count a quarter if the camera would have to
-    be upside down to see it from above. Points that lie on another plane, perhaps a wall, count a
-    quarter, too. Walls beside the first support, on which far fewer points stand, are left out. Of
-    parallel supports, a higher one as wide as furniture comes first. A rigid motion of all
-    arguments moves the supports alike.
+    support with the most points low above it (up to 60 mm, `SUPPORTS.low`) comes first. The points
+    count twice if the camera looks at the support, and half if it is bowed. They count a quarter if
+    the camera would have to be upside down to see it from above. Points that lie on another plane,
+    perhaps a wall, count a quarter, too. Walls beside the first support, on which far fewer points
+    stand, are left out. Of parallel supports, a higher one at least 0.3 m wide
+    (`SUPPORTS.furniture`) comes first. A rigid motion of all arguments moves the supports alike.
 
     Raises `NoSupport` if there is none.
     """

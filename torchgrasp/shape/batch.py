@@ -46,9 +46,10 @@ It returns tensors whose first axis is q.
 
 @dataclasses.dataclass(frozen=True)
 class Walls(Value):
-    """The posteriors of w surfaces with thin-plate kernels; missing observations have the weight 0.
+    """The Gaussian process posteriors of w surfaces, stacked; all have thin plate kernels.
 
-    Each surface has n observed points, the first `near` of them with normals.
+    Each surface has n observed points, the first `near` of them with normals. A surface with fewer
+    is filled up with observations of weight 0.
 
     Args:
         x: observed points, normalised, those with normals first.
@@ -72,9 +73,9 @@ class Walls(Value):
         shapes: Sequence[ShapeGP],
         device: torch.device,
     ) -> "Walls":
-        """Return the stacked posteriors of shapes, each of one surface.
+        """Return the posteriors of w shapes, each of one surface with a thin plate kernel, stacked.
 
-        The Cholesky factors are inverted on the `device`.
+        The result is on the `device`, where the Cholesky factors are inverted.
         """
         near = max(shape.n_oriented for shape in shapes)
         n = near + max(len(shape.x) - shape.n_oriented for shape in shapes)
@@ -110,8 +111,9 @@ class Walls(Value):
         return cls(x, a, b, whitener, psi)
 
     def weighted(self, wall: Int[Tensor, "q"]) -> Weighted:
-        """Return the observations and weights of each query point's surface, which has the index
-        `wall[q]`.
+        """Return what the posterior mean at each of q query points needs: observations and weights.
+
+        Query point i belongs to the surface with the index `wall[i]`.
         """
         psi = self.psi[wall, None]
         fast = partial(differentiate_thin_plate, psi)
@@ -123,11 +125,11 @@ class Walls(Value):
         wall: Int[Tensor, "q"],
         rows: CovarianceRows,
     ) -> CovarianceRows:
-        """Return `rows` (q, r), covariances with the observations, times the `whitener` of a
-        surface.
+        """Return each line of `rows` (q, r) times the `whitener` L^-T of its surface.
 
-        Line q of `rows` belongs to the surface with the index `wall[q]`. The dot product of two
-        lines of the result is the covariance that the observations of one surface explain.
+        Line i belongs to the surface with the index `wall[i]`. It holds the covariances of one
+        number with the r observed numbers of this surface. The dot product of two lines of the
+        result is the covariance that the observations of one surface explain.
         """
         return self._together(wall, rows, lambda own, matrix: (own @ matrix,))[0]
 
@@ -136,11 +138,11 @@ class Walls(Value):
         wall: Int[Tensor, "q"],
         rows: CovarianceRows,
     ) -> tuple[Float[Tensor, "q"], CovarianceRows]:
-        """Return the variance k A k that the observations explain, and k A, for each line k of
-        `rows`.
+        """Return (explained, solved): k A k^T (q,) and k A (q, r) for each line k of `rows` (q, r).
 
-        Line q holds the covariances k of one number with the observations of the surface `wall[q]`.
-        A is the inverse covariance of these observations.
+        Line i holds the covariances k of one number with the r observed numbers of the surface
+        `wall[i]`. A is the inverse covariance of these. k A k^T is the variance of the number that
+        they explain.
         """
 
         def explain(own: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -174,21 +176,22 @@ class Walls(Value):
 class ShapeBatch(Value):
     """The shapes of c clouds, for a batch in which each entry belongs to one cloud.
 
-    Points given to a method have the entries as axis 0. The points of entry r belong to the cloud
-    with the index `owner[r]`. Methods of q points (q, 3) take equally many points of each entry,
-    entry by entry. Numbers of a shape, such as its `scale`, are tensors with one number for each
-    entry. Distances at normalised points are normalised, too.
+    A batch has b entries (r in the annotation of `owner`). Points given to a method have the
+    entries as axis 0. The points of entry i belong to the cloud with the index `owner[i]`. Methods
+    of q points (q, 3) take equally many points of each entry, entry by entry. Numbers of a shape,
+    such as its `scale`, are tensors with one number for each entry. Distances at normalised points
+    are normalised, too.
 
     Args:
         surfaces: the posteriors of all surfaces: one for each cloud, then the inner ones of open
             vessels.
-        wall: the indices of each cloud's outer and inner surface, which are the same if the object
-            is not hollow.
-        centers: center [m] of each cloud.
+        wall: the indices (c, 2) of each cloud's outer and inner surface in `surfaces`. They are the
+            same if the object is not hollow.
+        centers: origin (c, 3) [m] of each cloud's normalised frame, in the frame of the cloud.
         scales: length [m] of one normalised unit of each cloud.
-        radii: domain radius of each cloud, normalised.
+        radii: radius (c,) of each cloud's domain, the ball in which the shape is known, normalised.
         factors: each cloud's ratio of true deviations to the posterior's standard deviations.
-        owner: index of the cloud of each entry.
+        owner: index (b,) of the cloud of each entry.
         hollow: whether any object is hollow.
     """
 
@@ -207,7 +210,7 @@ class ShapeBatch(Value):
         shapes: Sequence[ShapeGP],
         device: torch.device | None = None,
     ) -> "ShapeBatch":
-        """Return c shapes stacked to a batch of c entries, where entry k has shape k.
+        """Return c shapes stacked to a batch of c entries, where entry i has shape i.
 
         `device` is by default that of the shapes. Raises `BadArgument` for a kernel that is no thin
         plate.
@@ -245,26 +248,29 @@ class ShapeBatch(Value):
 
     @property
     def scale(self) -> Float[Tensor, "b"]:
-        """The length [m] of one normalised unit, for each of b entries."""
+        """The length (b,) [m] of one normalised unit, for each of b entries."""
         return self.scales[self.owner]
 
     @property
     def domain_radius(self) -> Float[Tensor, "b"]:
-        """The normalised radius within which the shape is known, for each of b entries."""
+        """The normalised radius (b,) of the ball in which the shape is known, for each of b
+        entries.
+        """
         return self.radii[self.owner]
 
     @property
     def std_factor(self) -> Float[Tensor, "b"]:
-        """The ratio of true deviations to the posterior's standard deviations, for each of b
+        """The ratio (b,) of true deviations to the posterior's standard deviations, for each of b
         entries.
         """
         return self.factors[self.owner]
 
     @cached_property
     def walls(self) -> "tuple[ShapeBatch, ...]":
-        """The outer surfaces and, if any object is hollow, the inner ones.
+        """The batch as batches of shapes of one surface: the outer ones, then the inner ones.
 
-        Each is a batch of shapes of one surface.
+        There are inner ones only if any object is hollow. The inner surface of an object that is
+        not hollow is its outer one.
         """
         if not self.hollow:
             return (self,)
@@ -279,7 +285,9 @@ class ShapeBatch(Value):
         self,
         points: Float[Tensor, "b *k 3"],
     ) -> Float[Tensor, "b *k 3"]:
-        """Return the points [m] of each of b entries in the normalised frame of its cloud."""
+        """Return the points (b, ..., 3) [m] of each of b entries in the normalised frame of its
+        cloud.
+        """
         center = spread(self.centers[self.owner].to(points), points, 1)
         return (points - center) / spread(self.scale.to(points), points)
 
@@ -287,12 +295,17 @@ class ShapeBatch(Value):
         self,
         x: Float[Tensor, "b *k 3"],
     ) -> Float[Tensor, "b *k 3"]:
-        """Return the normalised points of each of b entries in the frame of its cloud [m]."""
+        """Return the normalised points (b, ..., 3) of each of b entries as points [m] in the frame
+        of its cloud.
+        """
         return x * spread(self.scale, x) + spread(self.centers[self.owner], x, 1)
 
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (q, walls) of the surface among `walls` that applies at each of q
-        normalised points.
+        """Return which surface of `walls` determines the signed distance at each of q points `x`
+        (q, 3).
+
+        The result is a mask (q, walls) with one True in each row. The points are normalised,
+        equally many for each entry, entry by entry.
         """
         if not self.hollow:
             return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
@@ -315,8 +328,8 @@ class ShapeBatch(Value):
         """Return the mean signed distance with its first and second derivatives, at q points `x`
         (q, 3).
 
-        The points and the results are normalised. There are equally many points of each entry,
-        entry by entry.
+        The points and the results are normalised. The points are equally many for each entry, entry
+        by entry.
         """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
@@ -327,8 +340,8 @@ class ShapeBatch(Value):
     def variance(self, x: Queries) -> Float[Tensor, "q"]:
         """Return the variance (q,) of the signed distance at q normalised points `x` (q, 3).
 
-        It is in squared normalised units. There are equally many points of each entry, entry by
-        entry.
+        It is in squared normalised units, without `std_factor`. The points are equally many for
+        each entry, entry by entry.
         """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor]:
@@ -346,8 +359,8 @@ class ShapeBatch(Value):
         """Return mean and variance of the signed distance, with derivatives, at q points `x` (q,
         3).
 
-        The points and the results are normalised. There are equally many points of each entry,
-        entry by entry.
+        The points and the results are normalised. The mean has first and second derivatives, the
+        variance the first. The points are equally many for each entry, entry by entry.
         """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
@@ -357,8 +370,11 @@ class ShapeBatch(Value):
         return SurfaceJet(*self._evaluate(evaluate, x))
 
     def estimate(self, x: Queries) -> Moments:
-        """Return mean (q, 4) and covariance (q, 4, 4) of distance and gradient at q normalised
-        points, Eqs. (7)-(8) of the paper.
+        """Return (mean, covariance) of signed distance and gradient (d, w) at q points `x` (q, 3),
+        Eqs. (7)-(8) of the paper.
+
+        The mean is (q, 4) and the covariance (q, 4, 4). Points and results are normalised. The
+        points are equally many for each entry, entry by entry.
         """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,7 +29,8 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
     """Return the Gaussian process (`Posterior`) of the signed distance, given observations and a
     kernel.
 
-    It takes one Cholesky factor of the covariance of all observed numbers.
+    It computes one Cholesky factor, that of the covariance of all observed numbers. Raises
+    `IndefiniteCovariance` if this covariance is not positive definite.
     """
     observations = observations.with_normals_first()
     y, noise = observations.rows()
@@ -43,8 +44,9 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
 def check_kernel(posterior: Posterior, least_noise: float) -> None:
     """Raise `IndefiniteCovariance` if the covariance K of the observations is indefinite.
 
-    That can happen if observations are farther apart than the kernel allows. `least_noise` is the
-    least standard deviation of the observations, normalised.
+    That can happen if observations are farther apart than the kernel's `diameter`; only then is it
+    tested. `least_noise` is the least standard deviation of the observations, normalised. Its
+    square is added to the diagonal of K.
     """
     kernel = posterior.kernel
     posterior = map_tensors(torch.detach, posterior)
@@ -70,12 +72,13 @@ def append_observations(
     new: Observations,
     shared: Float[Tensor, "n c"] | None = None,
 ) -> Posterior:
-    """Return the posterior given the old and the `new` observations.
+    """Return the posterior given the observations of the `old` posterior and the `new` ones.
 
     It equals conditioning on all at once. The Cholesky factor L of the covariance K + noise grows
     by the rows [B^T, C] with B = L^-1 K(old, new). C is the factor of K(new, new) + noise - B^T B.
     `shared` (n, c) holds correlated errors of the n new distances, normalised: a column for each of
-    c independent causes.
+    c independent causes. Raises `IndefiniteCovariance` if the grown covariance is not positive
+    definite.
     """
     kernel = old.kernel
     if shared is not None:
@@ -118,7 +121,8 @@ def select_points(
     criterion: Criterion = "variance",
     stop: float = -math.inf,
 ) -> Selection:
-    """Return at most `budget` chosen candidates, and the posterior given them.
+    """Return at most `budget` chosen candidates, and the posterior given them and the known
+    observations.
 
     Each choice is the most informative candidate, given the known and the earlier chosen ones.
 
@@ -127,8 +131,9 @@ def select_points(
         known: observations that are given.
         kernel: kernel of the posterior.
         budget: largest number of chosen candidates.
-        criterion: what is greatest at the most informative candidate: "variance", "error" or "both"
-            (`fit_shape`).
+        criterion: what is greatest at the most informative candidate. It is the "variance" of its
+            distance, the "error" of the predicted distance, or with "both" |error| + 2
+            sqrt(variance).
         stop: the selection ends when no candidate's variance (squared normalised units) exceeds it.
 
     Each choice appends four rows to the Cholesky factor.
@@ -154,13 +159,14 @@ def choose_points(
     criterion: Criterion,
     stop: float,
 ) -> tuple[Int[Tensor, "picks"], Float[Tensor, "rows rows"], Float[Tensor, "rows"]]:
-    """Return (picks, L, L^-1 y): the choice of `select_points`, with the grown Cholesky factor.
+    """Return (picks, L, L^-1 y): the chosen observations, and the Cholesky factor that includes
+    them.
 
     `picks` are the indices of at most `budget` candidates, in the order of their choice. `start` is
     the posterior given the known observations, whose Cholesky factor grows to L by four rows for
     each pick. y are the observed numbers: those of `start`, then those of each pick. `criterion`
-    and `stop` are as in `select_points`: what is greatest at a pick, and the variance that ends the
-    choice.
+    says what is greatest at a pick: "variance", "error" or "both", as for `select_points`. `stop`
+    is the variance (squared normalised units) below which no pick is made.
     """
     x = candidates.x
     kernel = start.kernel

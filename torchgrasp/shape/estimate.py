@@ -125,10 +125,11 @@ class Observations(Batch):
         return float(every.detach().min())
 
     def check_normals(self) -> None:
-        """Raise `BadArgument` if an observed normal is not a unit vector, as one of a mesh's face
-        whose length is the face's area. All distances would be stretched.
+        """Raise `BadArgument` if the length of an observed normal is not near 1.
 
-        Lengths from 0.5 to 2 (`LENGTHS`) are taken, as an optimiser changes them a little.
+        Lengths from 0.5 to 2 (`LENGTHS`) are taken, as an optimiser changes them a little. Normals
+        of other lengths, such as those weighted by the areas of a mesh's faces, would stretch all
+        distances.
         """
         if not (is_known(self.normal) and is_known(self.has_normal)):
             return
@@ -156,7 +157,7 @@ def on_surface(
     """Return observations of n normalised points on the surface (distance 0) with outward unit
     normals.
 
-    `noise` is the standard deviation of each distance, normalised, `normal_noise` that of a
+    `noise` (n,) is the standard deviation of each distance, normalised. `normal_noise` is that of a
     normal's components.
     """
     yes = torch.ones(len(x), dtype=torch.bool, device=x.device)
@@ -285,8 +286,9 @@ def surface_deviation(
     variance: Float[Tensor, "*b"],
     gradient: Float[Tensor, "*b 3"],
 ) -> Float[Tensor, "*b"]:
-    """Return the standard deviation of the surface along its normal, normalised.
+    """Return the standard deviation (*b,) of the surface along its normal, normalised.
 
-    It is linearised: the root of the distance's `variance` over the length of its `gradient`.
+    It is linearised: the root of the signed distance's `variance` (*b,), divided by the length of
+    its `gradient` (*b, 3). b stands for any batch axes.
     """
     return variance.sqrt() / norm(gradient)

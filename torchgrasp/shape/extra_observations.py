@@ -195,8 +195,9 @@ def paper_support(
     """Return the paper's observations in addition to the cloud: its centre, and random points
     outside (Sec. 3.1).
 
-    `seen` is the cloud [m], and `noise` the standard deviation of distances (normalised) and
-    normals. `generator` draws the points.
+    The centre is inside, at distance -1. 20 points (`OUTSIDE.points`) on a sphere of radius 1.2
+    have the distance 1, all normalised. `seen` is the cloud [m], and `noise` the standard deviation
+    of distances (normalised) and of components of normals. `generator` draws the points.
     """
     center = seen.points.mean(0)
     scale = float(norm(seen.points - center).max())
@@ -210,7 +211,8 @@ def paper_support(
 def frame_around(points: Points) -> Normalisation:
     """Return the normalised frame of points (n, 3) [m].
 
-    Its origin is in the centre of their box, and its scale is the distance of the farthest point.
+    Its origin is the centre of the points' bounding box. Its scale [m] is the distance of the
+    farthest point from there.
     """
     center = find_middle(points)
     scale = float(norm(points - center).max())
@@ -223,14 +225,18 @@ def camera_support(
     noise: float,
     table: float | None,
 ) -> ExtraObservations:
-    """Return what is observed in addition to the cloud's points with the support "camera" of
-    `fit_shape`.
+    """Return the observations that `fit_shape` adds to the cloud's points with the support
+    "camera".
 
     Points on a sphere around the object are observed, and its centre if that is inside. Their
-    distances are those of the nearest points on the surface. If the cloud `seen` [m] is a view with
-    a `completion`, its hidden side and free space are observed, too. `noise` is the standard
-    deviation of the distance observed inside, normalised; `table` is the table's height [m], or
-    None.
+    distances are those of the nearest points on the surface. For a view, the outline, the hidden
+    side and free space are observed, too.
+
+    Args:
+        seen: the cloud [m], in a frame with z up.
+        completion: the estimated hidden side of a view; None for points from all sides.
+        noise: standard deviation of the distance observed at the centre, normalised.
+        table: the table's height [m]; None means no table.
     """
     kind: Kind = "whole"
     parts = ()
@@ -295,10 +301,11 @@ def observe(
     noise: float,
     normal_noise: float,
 ) -> Observations:
-    """Return normalised observations of n surface points [m] with outward unit normals.
+    """Return observations, normalised by `frame`, of n surface points (n, 3) [m] with outward unit
+    normals.
 
-    `noise` is their standard deviation [m] along the normals, and `normal_noise` that of a normal's
-    components.
+    `noise` is the points' standard deviation [m] along the normals, and `normal_noise` that of a
+    normal's components.
     """
     x = frame.normalise(points.to(frame.center))
     deviation = torch.full_like(x[:, 0], noise / frame.scale)
@@ -325,13 +332,14 @@ def vessel_supports(
     wall.
 
     Args:
-        cloud: the seen points [m], with z up.
+        cloud: the seen points [m] with normals, in a frame with z up.
         vessel: the vessel that the cloud shows.
         outline: silhouettes of the views.
         table: the table's height [m].
         noise: standard deviation of the distances observed off the surface, normalised.
 
-    The signed distances of the inner surface are positive in the cavity, as in `HollowShape`.
+    Both surfaces have observations in addition to their seen points. The signed distances of the
+    inner surface are positive in the cavity.
     """
     device = cloud.points.device
     cloud = cloud.to("cpu")
@@ -428,13 +436,15 @@ def free_space(
     reach: float = 1.0,
     outline_error: float = FREE.outline_error,
 ) -> FreeSpace:
-    """Return points in free space, and lower bounds of their signed distances, both normalised.
+    """Return points (n, 3) in free space, and lower bounds (n,) of their signed distances, both
+    normalised.
 
     Args:
-        outline: silhouettes of the views.
-        frame: the normalised frame.
+        outline: silhouettes of the views, in a frame with z up.
+        frame: the normalised frame of the results.
         table: the table's height [m]; None means no table.
-        reach: normalised radius within which the points lie.
+        reach: normalised radius of the object. Points within 1.15 times this (`FREE.radius`) are
+            returned.
         outline_error: distance [m] by which the object may reach beyond its outline.
 
     The points lie beside the object's outline, and below the table. A bound becomes an observation

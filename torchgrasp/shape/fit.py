@@ -203,13 +203,21 @@ def fit_upright(
     in_image: bool = False,
     neighbours: Neighbours | None = None,
 ) -> ShapeGP:
-    """Return the shape fitted to a cloud [m] without duplicates in a frame whose z axis points up.
+    """Return the shape fitted to a cloud [m] whose frame has z up, in the same frame.
 
-    `table` is the table's height [m]; None means no table. `seed` is the random seed, and `options`
-    are those of `fit_shape`. `in_image` says that the points were cut out of a depth image. Checks
-    of the camera, and for points of the table in the cloud, are then left out. `neighbours` are
-    those of the points in float64; None if they are not yet known. A `CloudWarning` is given for a
-    doubtful cloud, such as one in a plane.
+    `fit_shape` calls it with its cloud in an upright frame. The cloud must have no duplicate
+    points.
+
+    Args:
+        cloud: points of one object from one view or several, or from all sides.
+        seed: seed of the random draws.
+        table: the table's height [m]; None means no table.
+        options: the options of `fit_shape`.
+        in_image: whether the points were cut out of a depth image. Checks of the camera, and for
+            points of the table in the cloud, are then left out.
+        neighbours: nearest neighbours of the points in float64; None means that they are sought.
+
+    A `CloudWarning` is given for a doubtful cloud, such as one in a plane.
     """
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))

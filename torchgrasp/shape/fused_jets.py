@@ -21,30 +21,32 @@ Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, float]
 
 
 def evaluate_mean(of: Weighted, x: Queries, gradient: bool) -> tuple[Tensor, ...]:
-    """Return the mean distance (q,) at q normalised points and, if `gradient` is True, its
-    gradient.
+    """Return a surface's mean signed distance at q points and, if `gradient` is True, its gradient.
 
-    The gradient is (q, 3). `of` holds the observations and weights.
+    The result is (distance,) or (distance, gradient), of the shapes (q,) and (q, 3). It is at the
+    points `x` (q, 3), all normalised. `of` holds the observations of the surface and their weights.
     """
     found = _mean(of.arrays, x, bent=False)
     return found[:2] if gradient else found[:1]
 
 
 def evaluate_mean_jet(of: Weighted, x: Queries) -> tuple[tuple[Tensor, Tensor, Tensor], None]:
-    """Return ((distance, gradient, Hessian), None): the mean with derivatives at q normalised
-    points.
+    """Return ((distance, gradient, Hessian), None): a surface's mean signed distance with
+    derivatives.
 
-    `of` holds the observations and weights. The second result is always None: the compiled loops
-    keep no kernel values for the variance, unlike `jets.evaluate_mean_jet`.
+    They are (q,), (q, 3) and (q, 3, 3), at q points `x` (q, 3), all normalised. `of` holds the
+    observations of the surface and their weights. The second result is always None: the compiled
+    loops keep no kernel values for the variance, unlike `jets.evaluate_mean_jet`.
     """
     return _mean(of.arrays, x, bent=True), None
 
 
 def evaluate_jet(of: Weighted, x: Queries, explain: Explain) -> tuple[Tensor, ...]:
-    """Return mean and variance of the distance with derivatives at q normalised points.
+    """Return mean and variance of a surface's signed distance, with derivatives, at q points `x`.
 
-    They are distance, gradient, Hessian, variance and the gradient of the variance. `of` holds the
-    observations and weights; `explain` is `Posterior.explain` of their posterior.
+    They are distance (q,), gradient (q, 3), Hessian (q, 3, 3), variance (q,) and the variance's
+    gradient (q, 3). All are normalised. `of` holds the observations of the surface and their
+    weights. `explain` is `Posterior.explain` of their posterior.
     """
     mean = _mean(of.arrays, x, bent=True)
     near = len(of.b)
@@ -57,10 +59,11 @@ def evaluate_jet(of: Weighted, x: Queries, explain: Explain) -> tuple[Tensor, ..
 
 
 def rows_at(known: Points, near: int, kernel: Kernel, x: Queries) -> CovarianceRows:
-    """Return the covariance (q, rows) of the distances at q normalised points with all
-    observations.
+    """Return the prior covariance (q, r) of the signed distances at q points `x` with all r
+    observed numbers.
 
-    The first `near` of the observed points `known` have normals.
+    The observed numbers are the distances at the n points `known`. Then come the normals at the
+    first `near` of them, by component. Points are normalised. The `kernel` is a thin plate.
     """
     found = x.new_empty(len(x), len(known) + 3 * near)
     _put_rows(array(x), array(known.T), psi_of(kernel), near, found.numpy())
@@ -79,11 +82,12 @@ def arrays_of(
     a: Float[Tensor, "#q n"],
     b: Float[Tensor, "#q 3 near"],
 ) -> Arrays:
-    """Return the observed points (3, n), two arrays of weights, and the kernel's length psi.
+    """Return (points, a, b, psi) as NumPy arrays and a number, in the form that compiled loops
+    take.
 
-    The points and the kernel are those of `of`. All q query points share the weights `a` of
-    distances and `b` of normals, or each has its own. Weights of normals become (1 or q, 3, n);
-    points without normals get 0.
+    They are the observed points (3, n) and the kernel's length psi, both of `of`, and the given
+    weights. All q query points share the weights `a` of distances and `b` of normals, or each has
+    its own. Weights of normals become (1 or q, 3, n); points without normals get 0.
     """
     shifts = a.new_zeros(len(b), 3, len(of.x))  # points without normals have weight 0
     shifts[..., : b.shape[2]] = b
@@ -101,8 +105,10 @@ def psi_of(kernel: Kernel) -> float:
 def sum_thin_plate(x, y, a, b, psi, bent):
     """Return distance, gradient and Hessian of a posterior mean at a point x, as tuples.
 
-    They are sums over n observed points y (3, n), weighted by a for distances and b for normals.
-    The Hessian is the six numbers xx, yy, zz, xy, xz and yz, which are valid only if `bent`.
+    The mean is that of a surface's signed distance, with a thin plate kernel of length `psi`, all
+    normalised. They are sums over n observed points y (3, n), weighted by a for distances and b for
+    normals. The Hessian is the six numbers xx, yy, zz, xy, xz and yz, which are valid only if
+    `bent`.
     """
     distance = g0 = g1 = g2 = trace = xx = yy = zz = xy = xz = yz = 0.0
     for j in range(len(a)):

@@ -25,10 +25,10 @@ def choose_points(
 
     Args:
         start: the posterior given the known observations.
-        candidates: the observations to choose from.
+        candidates: the observations to choose from, all with normals.
         budget: greatest number of picks.
-        criterion: what a pick has most of: "variance" of the distance, "error" of the predicted
-            distance, or "both".
+        criterion: what a pick has most of: "variance" of the distance, or "error" of the predicted
+            distance. With "both" it is |error| + 2 sqrt(variance).
         stop: variance, in squared normalised units; the choice ends when none exceeds it.
     """
     x = candidates.x

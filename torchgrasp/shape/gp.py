@@ -535,6 +535,6 @@ def common_fields(
     value: Value,
     kind: type[Value],
 ) -> dict[str, Any]:
-    """Return the fields of a value, by name, that the class `kind` has, too."""
+    """Return those fields of a value that the class `kind` has, too: contents by name."""
     names = [f.name for f in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
     return {name: getattr(value, name) for name in names}

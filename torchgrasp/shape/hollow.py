@@ -255,12 +255,13 @@ class HollowShape(ShapeGP):
 
 
 def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
-    """Return the vessel after adding observations that give its wall the known thickness.
+    """Return the vessel after adding observations that give its wall the thickness
+    `middle.thickness`.
 
-    `middle` holds points in the middle of the wall, and the thickness. Two independent surfaces
-    might touch, which tears holes into the wall. In the wall's middle the signed distances from
-    both surfaces must sum to minus the thickness. Where they do not, the less certain surface gets
-    an observed distance that follows from the more certain one.
+    `middle` also holds points in the middle of the wall. Two independent surfaces might touch,
+    which tears holes into the wall. In the wall's middle the signed distances from both surfaces
+    must sum to minus the thickness. Where they do not, the less certain surface gets an observed
+    distance that follows from the more certain one.
     """
     x = middle.x
     thickness = middle.thickness

@@ -60,10 +60,10 @@ def evaluate_mean(
     x: Queries,
     gradient: bool,
 ) -> tuple[Tensor, ...]:
-    """Return the mean distance (q,) at q normalised points and, if `gradient` is True, its gradient
-    (q, 3).
+    """Return a surface's mean signed distance at q points and, if `gradient` is True, its gradient.
 
-    `of` holds the observations and weights.
+    The result is (distance,) or (distance, gradient), of the shapes (q,) and (q, 3). It is at the
+    points `x` (q, 3), all normalised. `of` holds the observations of the surface and their weights.
     """
     near = of.b.shape[-2]  # the points with normals come first
     if of.x.ndim == 2:
@@ -84,9 +84,11 @@ def evaluate_mean_jet(
     of: Weighted,
     x: Queries,
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Kernels]:
-    """Return ((distance, gradient, Hessian), kernel values): the mean at q normalised points.
+    """Return ((distance, gradient, Hessian), kernel values): a surface's mean signed distance with
+    derivatives.
 
-    `of` holds the observations and weights. The kernel values serve to compute the variance.
+    They are (q,), (q, 3) and (q, 3, 3), at q points `x` (q, 3), all normalised. `of` holds the
+    observations of the surface and their weights. The kernel values serve to compute the variance.
     """
     known = of.x
     a = of.a
@@ -118,10 +120,11 @@ def evaluate_jet(
     x: Queries,
     explain: Explain,
 ) -> tuple[Tensor, ...]:
-    """Return mean and variance of the distance with derivatives at q normalised points.
+    """Return mean and variance of a surface's signed distance, with derivatives, at q points `x`.
 
-    They are distance, gradient, Hessian, variance and the gradient of the variance. `of` holds the
-    observations and weights; `explain` is `Posterior.explain` of their posterior.
+    They are distance (q,), gradient (q, 3), Hessian (q, 3, 3), variance (q,) and the variance's
+    gradient (q, 3). All are normalised. `of` holds the observations of the surface and their
+    weights. `explain` is `Posterior.explain` of their posterior.
     """
     mean, (d, k, first, near_second) = evaluate_mean_jet(of, x)
     n = of.x.shape[-2]
@@ -147,9 +150,11 @@ def rows_at(
     kernel: Kernel,
     x: Queries,
 ) -> CovarianceRows:
-    """Return the covariance of the distances at q normalised points with all observations.
+    """Return the prior covariance (q, r) of the signed distances at q points `x` with all r
+    observed numbers.
 
-    The first `near` of the observed points `known` have normals.
+    The observed numbers are the distances at the n points `known`. Then come the normals at the
+    first `near` of them, by component. Points are normalised.
     """
     d, r = separations(x, known)
     k, first = kernel.derivatives(r, 2)
@@ -162,13 +167,16 @@ def distance_rows(
     first: Values,
     near: int,
 ) -> CovarianceRows:
-    """Return the covariance of q distances with all observations: k, then -k' d by component of a
-    normal.
+    """Return the prior covariance (q, r) of signed distances at q points with all r observed
+    numbers.
+
+    It is k for the n observed distances, then -k' d for the observed normals, by component.
 
     Args:
-        d: the three components (q, n) of the differences from the n observed points.
-        k: the kernel's values at their lengths.
-        first: the kernel's first derivative k' with respect to r^2 / 2 there.
+        d: the three components (q, n) of the differences between the q points and the n observed
+            ones.
+        k: the kernel's values (q, n) at the lengths r of these differences.
+        first: the kernel's derivative k' (q, n) with respect to r^2 / 2 there.
         near: number of the observed points with normals, which come first.
     """
     slope = first[:, :near]

@@ -49,10 +49,9 @@ PROFILE = ProfileNumbers()
 
 
 class Formula(partial[Any]):
-    """A function of a module with fixed arguments, equal to others with the same function and
-    arguments.
+    """A partial application of a function that equals others of the same function and arguments.
 
-    So a kernel made of it equals its copies, and can be pickled.
+    The function is one of a module. So a kernel made of it equals its copies, and can be pickled.
     """
 
     def _compared(self) -> tuple[Any, ...]:
@@ -130,9 +129,9 @@ class Kernel:
 
 
 def is_plain(*tensors: Tensor) -> bool:
-    """Return whether torch neither differentiates the tensors nor maps over them.
+    """Return whether torch neither differentiates the tensors nor maps over them (torch.vmap).
 
-    Then buffers may be reused.
+    Then operations in place are allowed, and buffers may be reused.
     """
     return all(is_known(x) and not is_tracked(x) for x in tensors)
 
@@ -200,7 +199,8 @@ def thin_plate(
 ) -> Float[Tensor, "*s"]:
     """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3 at normalised distances r, Eq. (6).
 
-    It is a covariance in a ball of diameter 3/4 psi.
+    It is positive definite, and so a covariance, only in a ball of diameter 3/4 psi. `psi` is the
+    kernel's length, normalised.
     """
     # Not factored as (psi - r)^2 (psi + 2 r): its derivative would cancel at r -> 0, where normals
     # need it.
@@ -234,7 +234,7 @@ def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
 
 
 def is_thin(kernel: Kernel) -> bool:
-    """Return whether a kernel is a thin plate in closed form."""
+    """Return whether a kernel is a thin plate whose derivatives are in closed form."""
     form = kernel.closed_form
     return isinstance(form, partial) and form.func is differentiate_thin_plate
 
@@ -326,9 +326,10 @@ def _differentiate_rbf(length: float, variance: float, r: Tensor, count: int) ->
 
 
 def kernel_of(kernel: KernelName | Kernel, psi: float) -> Kernel:
-    """Return a kernel, given itself or by its name.
+    """Return the `Kernel` of a name, or a given kernel itself.
 
-    The length of a named kernel follows from `psi`, a normalised length, as in `kernel_by_name`.
+    The length of a named kernel follows from the normalised length `psi`. Then the variance of a
+    distance is psi^3.
     """
     return kernel_by_name(kernel, psi) if isinstance(kernel, str) else kernel
 
@@ -353,14 +354,14 @@ def cross_covariance(
     y: Float[Tensor, "*q n 3"],
     n_oriented: int,
 ) -> Float[Tensor, "4 q rows"]:
-    """Return the covariance of distance (first) and gradient (x, y, z) at x with the observations
-    at y.
+    """Return the prior covariance (4, q, r) of distance and gradient at q points with r observed
+    numbers.
 
-    The q points `x` and n points `y` are normalised. With d = x - y, and derivatives by r^2 / 2,
-    Eqs. (2)-(5) of the paper give the blocks. They are k, k' d, -k' d^T and -k' I - k'' d d^T. The
-    last axis holds the distances at all y. Then follows each gradient component at the first
-    `n_oriented` points, which have normals. With a leading axis, `y` holds the observations of each
-    x.
+    The q points `x` and the n observed points `y` are normalised. With d = x - y, and derivatives
+    by r^2 / 2, Eqs. (2)-(5) of the paper give the blocks. They are k, k' d, -k' d^T and -k' I - k''
+    d d^T. The first axis holds the distance, then the gradient (x, y, z). The last axis holds the
+    distances at all y. Then follows each gradient component at the first `n_oriented` points, which
+    have normals. With a leading axis, `y` holds the observations of each x.
     """
     if not (kernel.closed_form and is_plain(x, y)):
         return _differentiable_cross_covariance(kernel, x, y, n_oriented)
@@ -418,8 +419,8 @@ def separations(
     """Return (differences, distances): the three components (q, n) of x - y, and |x - y|, of all
     pairs.
 
-    They are free of cancellation. With a leading axis, `y` holds the points that each x is compared
-    with.
+    The distances are computed from the differences, without cancellation. With a leading axis, `y`
+    holds the points that each x is compared with.
     """
     pairs = zip(x[:, None].unbind(2), y.unbind(-1), strict=True)
     d = [one - other for one, other in pairs]
@@ -435,10 +436,10 @@ def covariance_rows(
     y: Float[Tensor, "m 3"],
     other_oriented: int,
 ) -> Float[Tensor, "rows columns"]:
-    """Return the covariance of the observed numbers at normalised points x with those at y.
+    """Return the prior covariance of the observed numbers at normalised points x with those at y.
 
-    The first `n_oriented` points of x and `other_oriented` of y have normals. Distances come first,
-    then normals by component.
+    The first `n_oriented` points of x and `other_oriented` of y have normals. Rows are the numbers
+    at x, and columns those at y. Distances come first, then normals by component.
     """
     block = cross_covariance(kernel, x, y, other_oriented)
     if n_oriented == len(x):
@@ -451,8 +452,9 @@ def gram(
     x: Points,
     n_oriented: int,
 ) -> Float[Tensor, "rows rows"]:
-    """Return the covariance matrix of all observed numbers at the normalised points x.
+    """Return the prior covariance matrix (r, r) of all r observed numbers at n normalised points x.
 
-    The first `n_oriented` points have normals. Distances come first, then normals by component.
+    The first `n_oriented` points have normals. The n distances come first, then normals by
+    component. Noise is not included.
     """
     return covariance_rows(kernel, x, n_oriented, x, n_oriented)

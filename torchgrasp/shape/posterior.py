@@ -65,12 +65,13 @@ SINGULAR = 1e-12
 
 @dataclasses.dataclass(frozen=True)
 class Posterior(Value):
-    """A Gaussian process given observed distances and normals, in normalised units and float64.
+    """The posterior of a Gaussian process over the signed distance, given observed distances and
+    normals.
 
-    n counts observed points, and r observed numbers: n distances, and three for each observed
-    normal. (d, w) are the signed distance and its gradient. All methods but `explain` are
-    differentiable, to any order, in the points and in the posterior's tensors. Plain tensors take
-    faster formulas, which reuse buffers.
+    All is in normalised units and float64. n counts observed points, and r observed numbers: n
+    distances, and three for each observed normal. (d, w) are the signed distance and its gradient.
+    All methods but `explain` are differentiable, to any order, in the points and in the posterior's
+    tensors. Plain tensors take faster formulas, which reuse buffers.
     """
 
     x: Points  # observed points (n, 3), those with normals first
@@ -84,8 +85,8 @@ class Posterior(Value):
 
     @kept
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
-        """The matrix L^-T (r, r) as a list of blocks of columns. L (`factor`) is the Cholesky factor
-        of the covariance of the r observed numbers with their noise.
+        """The matrix L^-T (r, r), as a list of blocks of its columns. L (`factor`) is the Cholesky
+        factor of the covariance of the r observed numbers with their noise.
 
         The block of the columns i to j - 1 holds the rows 0 to j - 1. The rows below are zero.
         """
@@ -213,11 +214,12 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of signed distance and gradient, Eqs. (7)-(8) of the paper. It
-        is at k points `x` (k, 3) that `normalise` returned.
+        """Return the joint posterior of signed distance and gradient at k points `x` (k, 3), Eqs.
+        (7)-(8) of the paper.
 
-        The result is normalised: one unit is `scale` [m]. `joint` does the same for points [m], but
-        limits their number and refuses points outside the domain.
+        The points are those that `normalise` returned. The result is normalised: one unit is
+        `scale` [m]. It has the covariances between all k points. `joint` does the same for points
+        [m], but limits their number and refuses points outside the domain.
         """
         k = len(x)
         cross = self.cross(x)
@@ -232,7 +234,8 @@ class Posterior(Value):
         """Return the prior covariance (4, 4) of signed distance (index 0) and gradient (1 to 3) at
         a point, normalised.
 
-        It is the same at every point.
+        It is the same at every point. Distances are in units of `scale` [m], and gradients have no
+        unit.
         """
         here = self.x.new_zeros(1, 3)
         return cross_covariance(self.kernel, here, here, 1)[:, 0]
@@ -319,11 +322,11 @@ class Posterior(Value):
 
     @kept
     def weighted(self) -> Weighted:
-        """The observed points, the weights of their distances and normals in the posterior mean,
-        and the kernel.
+        """What the posterior mean is made of: observed points, weights of their distances and
+        normals, and the kernel.
 
-        Of its fields, `x` (n, 3) are the n observed points, normalised. `a` (n,)
-        are the weights of their distances, and `b` (k, 3) those of the k observed normals.
+        Of its fields, `x` (n, 3) are the n observed points, normalised. `a` (n,) are the weights of
+        their distances, and `b` (k, 3) those of the k observed normals.
         """
         n = len(self.x)
         normals = self.weights[n:].reshape(3, self.n_oriented).T
@@ -348,10 +351,11 @@ def combined_covariance(
     x: Float[Tensor, "b g p 3"],
     weights: Float[Tensor, "#b #g m p"],
 ) -> Float[Tensor, "b v v"]:
-    """Return the covariance of weighted sums of distances, in squared normalised units.
+    """Return the posterior covariance of weighted sums of signed distances, normalised.
 
-    `x` holds g groups of p normalised points in each of b entries. `weights` are those of m sums
-    over each group's points. The result covers all v = g m sums of an entry.
+    The sums are over points: `x` holds g groups of p normalised points in each of b entries.
+    `weights` are those of m sums over each group's points. The result (b, v, v) covers all v = g m
+    sums of an entry, in squared normalised units.
     """
     b, g, p, _ = x.shape
     rows = len(posterior.factor)
@@ -382,9 +386,9 @@ def symmetric_root(
     """Return the symmetric square roots of covariance matrices, unique even with equal eigenvalues.
 
     Rounding may turn eigenvalues of zero, as of coinciding points, slightly negative; they count as
-    zero. More negative ones, relative to the `prior` variance, raise `IndefiniteCovariance`, whose
-    message ends with `fix`. The root is differentiable twice. Where eigenvalues are zero, its
-    derivatives are those along covariances of the same rank.
+    zero. Eigenvalues below -1e-8 (`LEAST_EIGENVALUE`) times the `prior` variance raise
+    `IndefiniteCovariance`, whose message ends with `fix`. The root is differentiable twice. Where
+    eigenvalues are zero, its derivatives are those along covariances of the same rank.
     """
     values, vectors = torch.linalg.eigh(covariance.detach())
     if is_known(values) and values.numel():

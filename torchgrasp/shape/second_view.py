@@ -179,11 +179,12 @@ def next_view(
 def find_seen(
     points: Points, normals: Points, eyes: Float[Tensor, "v 3"], field: SignedDistanceField
 ) -> Bool[Tensor, "v n"]:
-    """Return which of n surface points each of v cameras sees.
+    """Return a mask (v, n) of which of n surface points each of v cameras sees.
 
-    `points`, `normals` and the cameras' positions `eyes` [m] are in the frame of the `field`, the
-    distances from the surface. A ray from a point to a camera must not meet the surface again. The
-    cosine between ray and normal must exceed 0.3 (`VIEW.least_cosine`).
+    `points` (n, 3) [m], their outward unit `normals` and the cameras' positions `eyes` [m] are in
+    one frame. It is that of the `field`, the signed distances from the surface. A ray from a point
+    to a camera must not meet the surface again. The cosine between ray and normal must exceed 0.3
+    (`VIEW.least_cosine`).
     """
     offset = eyes[:, None] - points
     towards = unit(offset)
@@ -208,12 +209,12 @@ def find_seen(
 def expect_deviation(
     shape: ShapeGP, targets: Float[Tensor, "t 3"], points: Points, seen: Bool[Tensor, "v n"]
 ) -> tuple[Float[Tensor, "t"], Float[Tensor, "v t"]]:
-    """Return (before, after): the surface's standard deviation [m] at t targets now, and after each
-    view.
+    """Return (before, after): the surface's standard deviation [m] at t targets, before and after a
+    second view.
 
-    The t `targets` and n `points` [m] are in the cloud's frame. View k of v measures the points in
-    the mask `seen[k]`. The posterior's covariance does not depend on what is measured, so it is
-    known before.
+    `before` is (t,), and `after` (v, t) has a line for each of v views. The t `targets` and n
+    `points` [m] are in the cloud's frame. View i measures the points in the mask `seen[i]`. The
+    posterior's covariance does not depend on the measured values, so it is known before.
     """
     count = len(points)
     joint = shape.joint(torch.cat([points, targets]).double())

@@ -160,9 +160,10 @@ def extract_mesh(shape: ShapeGP) -> Mesh:
 def collision_field(shape: ShapeGP, mesh: Mesh) -> SignedDistanceField:
     """Return the signed distance field of the mesh of a shape, for collision checks.
 
-    `mesh` is the result of `extract_mesh`. The nodes are 4 mm apart for thick bodies, and 3 mm for
-    others (`NODES`). Raises `SuspiciousScale` for an object that is much larger than a hand, as its
-    grid would exceed 20 million nodes.
+    `mesh` is the result of `extract_mesh`, and the field is in its frame, that of the cloud. The
+    nodes are 4 mm apart for thick bodies, and 3 mm for others (`NODES`). A thick body is not
+    hollow, and extends more than 40 mm along each axis. Raises `SuspiciousScale` for an object that
+    is much larger than a hand, as its grid would exceed 20 million nodes.
     """
     size = mesh.vertices.amax(0) - mesh.vertices.amin(0)
     thick = float(size.min()) > NODES.thick and len(shape.walls) == 1
@@ -303,8 +304,9 @@ def newton_step(
     """Return Newton steps (n, 3) along the gradients to the zero level, each at most `longest`
     long.
 
-    `value` is the mean distance at n points. Distances, `longest` and steps are normalised. Squared
-    slopes below `least_slope` are raised to it.
+    `value` (n,) is the mean signed distance at n points, and `gradient` (n, 3) its gradient.
+    Distances, `longest` and steps are normalised. Squared lengths of gradients, by which is
+    divided, are raised to at least `least_slope`.
     """
     step = -value / (gradient * gradient).sum(-1).clamp_min(least_slope)
     return limit_norm(step[:, None] * gradient, longest)

@@ -110,20 +110,20 @@ ROUND = RoundNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Revolution:
-    """A body of revolution about a vertical axis, found in a cloud of n points."""
+    """A body of revolution about an axis along z, found in a cloud of n points."""
 
     center: Float[Tensor, "2"]  # position (x, y) [m] of the axis, in the frame of the cloud
     body: Bool[Tensor, "n"]  # mask of the cloud's points on the body
 
 
 def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution] | None:
-    """Return (axis_from_cloud, body): the transform to the frame of an axis of revolution, and its
-    body.
+    """Return (axis_from_cloud, body): the body of revolution in a cloud, and the transform to its
+    axis.
 
-    The transform is rigid [m], and its frame has the axis as z axis. The result is None if there is
-    no such body. The axis is fitted to the probes of the scorer, which are points of the cloud. The
-    body, rotated about the axis, must stay out of the table. It must also stay out of the space
-    that the cameras saw to be empty.
+    `axis_from_cloud` is the rigid transform [m] to a frame whose z axis is the axis of revolution.
+    `body` is in this frame. The result is None if there is no such body. The axis is fitted to the
+    probes of the scorer, which are points of the cloud. The body, rotated about the axis, must stay
+    out of the table. It must also stay out of the space that the cameras saw to be empty.
     """
     center, direction, cost = _fit_axis(*scorer.probes)
     if not cost < AXIS_FIT.cost:
@@ -153,9 +153,11 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
 
 
 def find_revolution(points: Points, normals: Points) -> Revolution | None:
-    """Return the upright body of revolution to which most points belong; None if there is none.
+    """Return the body of revolution about a vertical axis to which most points belong; None if
+    there is none.
 
-    `points` (n, 3) [m] and outward unit `normals` (n, 3) are in a frame with z up.
+    `points` (n, 3) [m] and outward unit `normals` (n, 3) are in a frame with z up. At least 60 % of
+    the points (`ROUND.body_share`) must be on the body.
     """
     lines = _lines_from_above(points, normals)
     center = _fit_to_lines(points, lines)

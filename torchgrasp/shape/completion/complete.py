@@ -144,8 +144,8 @@ class Completion(Value):
 
     @checked
     def moved(self, b_from_a: Pose) -> "Completion":
-        """Return the completion in frame b, given the rigid transform `b_from_a` [m] from its own
-        frame a.
+        """Return the completion in frame b, given the rigid transform `b_from_a` (4, 4) [m] from
+        its own frame a.
         """
         normals = rotate(b_from_a, self.planes[:, :3])
         offsets = self.planes[:, 3:] + normals @ b_from_a[:3, 3:]
@@ -159,9 +159,9 @@ class Completion(Value):
 
     @property
     def deviations(self) -> Float[Tensor, "m k"]:
-        """The correlated errors D [m] of the m points along their normals.
+        """The correlated errors D (m, k) [m] of the m points along their normals.
 
-        There is a column for each of k independent causes.
+        There is a column for each of k independent causes, at one standard deviation of it.
         """
         return correlated_errors(self.points, self.shared, self.asymmetry)
 
@@ -171,11 +171,13 @@ def correlated_errors(
     shared: Float[Tensor, "m c"],
     local: Float[Tensor, "m"] | float,
 ) -> Float[Tensor, "m k"]:
-    """Return correlated errors [m] of m points [m], a column for each of k independent causes.
+    """Return correlated errors (m, k) [m] of m points (m, 3) [m]: a column for each of k
+    independent causes.
 
-    The first c columns are the `shared` errors [m]. The others are the modes of a smooth random
-    field. Its variance at a point is the sum of squares of the `local` and the `shared` errors
-    there [m^2].
+    A column holds the errors at one standard deviation of its cause. The first c columns are the
+    `shared` errors [m]. The others are the modes of a smooth random field, alike within about 20 mm
+    (`HIDDEN.part`). The field's variance at a point is the sum of squares of the `local` and the
+    `shared` errors there [m^2].
     """
     deviation = torch.sqrt(local**2 + (shared**2).sum(1))
     alike = torch.exp(-0.5 * (torch.cdist(points, points) / HIDDEN.part) ** 2)
@@ -189,13 +191,15 @@ def complete_cloud(
     table: float | None = None,
     budget: Count = 50,
 ) -> Completion:
-    """Return at most `budget` points of the hidden side, from the cloud's symmetry, with their
+    """Return the estimated hidden side of a cloud [m]: at most `budget` points, with their
     uncertainty.
 
-    The cloud is mirrored across its best planes and across pairs of them; images in better planes
-    come first. A body of revolution and a part attached to it, such as a handle, are mirrored
-    separately. This is done in the frame of the axis. `table` is the height [m] of a table with
-    normal z, or None. Raises `BadArgument` for a cloud without outward normals or viewpoints.
+    A body like a ball is completed by a fitted ellipsoid. Another cloud is mirrored across its best
+    mirror planes and pairs of them; images in better planes come first. A body of revolution and a
+    part attached to it, such as a handle, are mirrored separately. This is done in the frame of the
+    axis. `table` is the height [m] of a table with normal z; None means no table. No point is
+    returned if the image border cuts the object off. Raises `BadArgument` for a cloud without
+    outward normals or viewpoints.
     """
     if cloud.normals is None or cloud.viewpoint is None:
         needed = "outward normals and viewpoints: see prepare_cloud"
@@ -415,11 +419,12 @@ def merge_hidden(
     allowed: Callable[[SomeHidden], Bool[Tensor, "n"]],
     thin: Callable[[Points], Int[Tensor, "k"]],
 ) -> SomeHidden:
-    """Return `merged` with further points: those of the `parts` that are `allowed` and not near
+    """Return the points `merged`, joined with those of the `parts` that are `allowed` and not near
     earlier points.
 
-    `allowed(part)` is a mask of the part's points. `thin(points)` returns the indices of the points
-    to keep, given points (n, 3) [m].
+    Near means at most 4 mm away (`HIDDEN.spacing`). A part is a batch of hidden points, such as a
+    `HiddenWall`. `allowed(part)` is a mask of the part's points. `thin(points)` returns the indices
+    of the points to keep, given points (n, 3) [m].
     """
     for part in parts:
         new = part[allowed(part)]

@@ -69,11 +69,14 @@ ELLIPSOID = EllipsoidNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Ellipsoid:
-    """An ellipsoid fitted to a cloud, as n points spread over all of it."""
+    """An ellipsoid fitted to a cloud, as n points spread over all of it. They are in the frame of
+    the cloud.
+    """
 
-    points: Points  # (n, 3) [m]
-    normals: Points  # (n, 3), outward unit normals
-    # standard deviations [m] along the normals, a column for each of 9 independent errors
+    points: Points  # n points (n, 3) [m] on the ellipsoid
+    normals: Points  # outward unit normals (n, 3) at these points
+    # errors [m] of the points along their normals, a column for each of 9 independent causes at one
+    # standard deviation of it
     deviations: Float[Tensor, "n 9"]
     misfit: float  # RMS distance [m] of the cloud from the ellipsoid
 
@@ -86,11 +89,12 @@ def find_ellipsoid(
 ) -> Ellipsoid | None:
     """Return the ellipsoid, nearly a ball, that fits the whole cloud, or None if there is none.
 
-    It fits if the cloud's RMS distance from it is at most 1.65 mm (`ELLIPSOID.misfit`), among other
-    bounds. No axis may be more than 1.5 times another. `points` (n, 3) [m] and outward unit
-    `normals` (n, 3) are those of the cloud, and `outline` is its silhouettes. `table` is the
-    table's height z [m]; None means no table. The body may have a flat foot: the ellipsoid may
-    reach below the table, but not float above it.
+    It fits if the cloud's RMS distance from it is at most 1.65 mm (`ELLIPSOID.misfit`). It may also
+    not exceed 5.2 % of the mean radius. The normals must agree, with a mean cosine of at least 0.9
+    (`ELLIPSOID.agreement`). No axis may be more than 1.5 times another. `points` (n, 3) [m] and
+    outward unit `normals` (n, 3) are those of the cloud, and `outline` holds its silhouettes.
+    `table` is the table's height z [m]; None means no table. The body may have a flat foot: the
+    ellipsoid may reach below the table, but not float above it.
     """
     rows = pick_apart(points, ELLIPSOID.points)
     fit = _Fit(points[rows].numpy(), normals[rows].numpy(), outline, table)

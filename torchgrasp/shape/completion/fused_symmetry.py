@@ -14,13 +14,20 @@ from torchgrasp.geometry.fused_vectors import add, dot, minus, put
 def match_images(
     probes: tuple[Tensor, Tensor], normals: Tensor, boxes: Boxes, planes: Tensor, far: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the probes (p, k, 3) [m] mirrored in p planes, their distances (p, k) [m] from the
-    nearest points of the cloud, and the cosines (p, k) of the normals there.
+    """Return (mirrored, distance, cosine): k points of a cloud mirrored in p planes, and their
+    match.
 
-    `probes` are k points [m] and their unit normals. `planes` (p, 4) are (n, o) for planes n . x =
-    o, with a unit normal n and an offset o [m]. `boxes` hold the n points of the cloud, and
-    `normals` (n, 3) are theirs. Beyond `far` [m] the distance is infinity, and the cosine that with
-    the first normal.
+    `mirrored` (p, k, 3) [m] are the mirrored points. `distance` (p, k) [m] is that from the nearest
+    point of the cloud. `cosine` (p, k) is that of the angle between the mirrored normal and the
+    cloud's normal there.
+
+    Args:
+        probes: the k points (k, 3) [m], and their unit normals (k, 3).
+        normals: unit normals (n, 3) of the cloud's n points.
+        boxes: the cloud's points in a tree of boxes.
+        planes: p planes n . x = o as (n, o), with a unit normal n and an offset o [m].
+        far: distance [m] beyond which no match is sought. There the distance is infinity, and the
+            cosine is that with the cloud's first normal.
     """
     p = len(planes)
     k = len(probes[0])
@@ -73,13 +80,18 @@ def look_up(
     rasters: tuple[Tensor, Tensor],
     least_depth: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each point's distance from an outline, the depth [m] seen there, and its own depth
-    [m].
+    """Return (away, visible, own): where points (*b, 3) [m] are in a silhouette, each (*b,).
 
-    The `points` (*b, 3) are in metres. The signed distance is that in the image plane at depth 1,
-    positive outside (no unit). `camera` holds the camera's position [m], its axes, and the first
-    node of the silhouette's rasters. `cell` is the distance of neighbouring nodes at depth 1.
-    `rasters` hold distance and depth at the nodes. Own depths are at least `least_depth` [m].
+    `away` is the signed distance from the outline in the image plane at depth 1, positive outside
+    (no unit). `visible` is the depth [m] of the surface seen there, and `own` that of the point.
+
+    Args:
+        points: the points, in the frame of the cloud.
+        camera: position (3,) [m] of the camera, its axes (3, 3), and the first node (2,) of the
+            rasters.
+        cell: distance of neighbouring nodes at depth 1.
+        rasters: distance from the outline (h, w), and depth [m] (h, w), at the nodes.
+        least_depth: least depth [m] of a point: `own` is not less.
     """
     shape = points.shape[:-1]
     rows = array(points.reshape(-1, 3))

@@ -88,7 +88,7 @@ TIE = 2e-9
 
 
 def find_middle(points: Points) -> Float[Tensor, "3"]:
-    """Return the centre of the box around points (n, 3), in their unit."""
+    """Return the centre (3,) of the bounding box of points (n, 3), in their unit."""
     return (points.amax(0) + points.amin(0)) / 2
 
 
@@ -96,8 +96,11 @@ def pick_apart(
     points: Float[Tensor, "n d"],
     count: int,
 ) -> Int[Tensor, "picks"]:
-    """Return the indices of at most `count` points that lie far apart. A rigid motion of all points
-    does not change the choice.
+    """Return the indices of `count` points, or of all if fewer, each the farthest from those before
+    it.
+
+    The choice begins with the first point. Distances that differ by rounding count as equal. So a
+    rigid motion of all points does not change the choice.
     """
     return farthest_points(points, count, tie=TIE)
 
@@ -132,9 +135,12 @@ class Silhouette(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of points [m] from the visual hull, positive outside.
+        """Return the signed distance (*b,) [m] of points (*b, 3) [m] from the visual hull, positive
+        outside.
 
-        The visual hull is the cone of all camera rays within the outline.
+        The visual hull is the cone of all camera rays within the outline. The distance is that in
+        the image plane at the depth of the point. Points are in the frame of the cloud, and b
+        stands for any batch axes.
         """
         outside, _, depth = self._look_up(points)
         return outside * depth
@@ -144,9 +150,11 @@ class Silhouette(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b"]:
-        """Return how far [m] points [m] are outside the outline or in front of the visible surface.
+        """Return how far [m] points (*b, 3) [m] are outside the outline or in front of the visible
+        surface.
 
-        It is 0 for points that may be hidden. Space in front counts from 2 mm (`OUTLINE.front`)
+        The result is (*b,), and 0 for points that may be hidden. Points are in the frame of the
+        cloud, and b stands for any batch axes. Space in front counts from 2 mm (`OUTLINE.front`)
         before the surface on, because of noise.
         """
         outside, visible, depth = self._look_up(points)
@@ -155,8 +163,8 @@ class Silhouette(Value):
 
     @checked
     def moved(self, b_from_a: Pose) -> "Silhouette":
-        """Return the silhouette in frame b, given the rigid transform `b_from_a` [m] from its own
-        frame a.
+        """Return the silhouette in frame b, given the rigid transform `b_from_a` (4, 4) [m] from
+        its own frame a.
         """
         viewpoint = apply(b_from_a, self.viewpoint[None])[0]
         rim = apply(b_from_a, self.rim)
@@ -216,13 +224,15 @@ class Outlines(Value):
 
     @property
     def gap(self) -> float:
-        """The greatest width [m] of an area without measurements within the outline, or 0."""
+        """The greatest width [m], over all views, of an area without measurements within the
+        outline, or 0.
+        """
         return max(view.gap for view in self.views)
 
     @checked
     def moved(self, b_from_a: Pose) -> "Outlines":
-        """Return the outlines in frame b, given the rigid transform `b_from_a` [m] from their own
-        frame a.
+        """Return the outlines in frame b, given the rigid transform `b_from_a` (4, 4) [m] from
+        their own frame a.
         """
         return Outlines(tuple(view.moved(b_from_a) for view in self.views))
 
@@ -231,8 +241,8 @@ class Outlines(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of points [m] from the visual hull of all views, positive
-        outside.
+        """Return the signed distance (*b,) [m] of points (*b, 3) [m] from the visual hull of all
+        views. It is positive outside; b stands for any batch axes.
         """
         return torch.stack([view.hull_distance(points) for view in self.views]).amax(0)
 
@@ -241,10 +251,12 @@ class Outlines(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b"]:
-        """Return how far [m] points [m] are outside the outline or in front of the visible surface.
+        """Return how far [m] points (*b, 3) [m] are outside the outline or in front of the visible
+        surface.
 
-        It is that of the worst view, and 0 for points that may be hidden. Space in front counts
-        from 2 mm (`OUTLINE.front`) before the surface on, because of noise.
+        The result (*b,) is that of the worst view, and 0 for points that may be hidden. b stands
+        for any batch axes. Space in front counts from 2 mm (`OUTLINE.front`) before the surface on,
+        because of noise.
         """
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
@@ -252,7 +264,7 @@ class Outlines(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Bool[Tensor, "*b"]:
-        """Return a mask of the points [m] that may be on the hidden side.
+        """Return a mask (*b,) of the points (*b, 3) [m] that may be on the object's hidden side.
 
         They are less than 1 mm (`OUTLINE.beside`) outside the visual hull. They are also less than
         4 mm in front of the visible surface of every view.
@@ -275,12 +287,13 @@ def silhouettes(cloud: PointCloud) -> Outlines:
 
 
 def silhouette(view: PointCloud) -> Silhouette:
-    """Return the silhouette of one view [m]; raise `BadArgument` for one that shows both sides.
+    """Return the silhouette of one view [m]; raise `BadArgument` for one that shows both sides of
+    the object.
 
-    Within the outline there may be gaps, where nothing was measured. A gap counts as a hole (free
-    space) only if it is wide. It must be far wider than the surface around it, as in a frame of
-    bars. Other gaps do not count as free space: a mirror-like patch is not measured, and leaves a
-    gap, too.
+    The outline is made from discs around the pixels of the view's points. Within the outline there
+    may be gaps, where nothing was measured. A gap counts as a hole (free space) only if it is wide.
+    It must be far wider than the surface around it, as in a frame of bars. Other gaps do not count
+    as free space: a mirror-like patch is not measured, and leaves a gap, too.
     """
     assert view.viewpoint is not None
     image = _check_view(view.points, view.viewpoint)

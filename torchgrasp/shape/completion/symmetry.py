@@ -153,7 +153,8 @@ class SymmetryScorer:
 
     @classmethod
     def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":
-        """Return the scorer of a cloud [m] with normals, of which any point may become a probe.
+        """Return the scorer of a cloud [m] with normals and viewpoints. Its probes are up to 150
+        points (`SYMMETRY.probes`) that lie far apart.
 
         `table` is the table's height [m]; None means no table.
         """
@@ -165,9 +166,9 @@ class SymmetryScorer:
         return whole.for_part(every)
 
     def about_axis(self, axis_from_cloud: Float[Tensor, "4 4"]) -> "SymmetryScorer":
-        """Return the scorer in a frame whose z axis is the axis of revolution.
+        """Return the scorer moved to a frame whose z axis is the axis of a body of revolution.
 
-        `axis_from_cloud` is the rigid transform [m] to this frame.
+        `axis_from_cloud` (4, 4) is the rigid transform [m] to this frame. The result is `upright`.
         """
         points = apply(axis_from_cloud, self.points)
         normals = rotate(axis_from_cloud, self.normals)
@@ -176,15 +177,17 @@ class SymmetryScorer:
         return SymmetryScorer(points, normals, outline, table, True, self.rows)
 
     def for_part(self, rows: Int[Tensor, "k"]) -> "SymmetryScorer":
-        """Return the scorer with probes chosen only from the points of the cloud with the indices
-        `rows`.
+        """Return the scorer with probes chosen only from one part of the cloud: its points with the
+        indices `rows` (k,).
         """
         chosen = pick_apart(self.points[rows], SYMMETRY.probes)
         return dataclasses.replace(self, rows=rows[chosen])
 
     @functools.cached_property
     def probes(self) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
-        """The k points [m] of the cloud that a plane is tested on, and their unit normals."""
+        """The k points (k, 3) [m] of the cloud that are mirrored to test a plane, and their unit
+        normals.
+        """
         return self.points[self.rows], self.normals[self.rows]
 
     @functools.cached_property
@@ -194,7 +197,9 @@ class SymmetryScorer:
 
     @functools.cached_property
     def boxes(self) -> Boxes:
-        """All points of the cloud in a tree of boxes, for compiled loops."""
+        """All points of the cloud in a tree of boxes, in which compiled loops find nearest
+        neighbours.
+        """
         return sort_into_boxes(self.points.numpy())
 
     @property
@@ -214,7 +219,8 @@ class SymmetryScorer:
     ) -> tuple[Tensor, Tensor]:
         """Return (distance, index) of the cloud point nearest to each of the points (..., 3) [m].
 
-        The distance is in metres. If no point is within the `limit` [m], they are infinity and 0.
+        The distance is in metres, and the index is that in `points` of the scorer. If no point is
+        within the `limit` [m], distance and index are infinity and 0.
         """
         rows = points.reshape(-1, 3).numpy()
         if is_fused(points):
@@ -231,10 +237,11 @@ class SymmetryScorer:
         self,
         planes: Float[Tensor, "p 4"],
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-        """Return (scores, violations) of p planes n.x = o, given as (n, o [m]).
+        """Return (scores, violations), both (p,), of p mirror planes n.x = o, given as (n, o [m]).
 
         The score is the match of the mirror image with the cloud, in [0, 1], minus twice the
-        violation. The violation of free space is in [0, 1].
+        violation. The violation, in [0, 1], says how deep mirrored points are in free space or
+        below the table. Both are means over the probes.
         """
         points, normals = self.probes
         far = SYMMETRY.far * SYMMETRY.match
@@ -264,8 +271,8 @@ def find_planes(
     scorer: SymmetryScorer,
     turned: bool = False,
 ) -> tuple[Mirrors, Float[Tensor, "p"]]:
-    """Return (planes, scores): the mirror planes (n, o [m]) of a cloud, best first, and their
-    scores.
+    """Return (planes, scores): the p mirror planes (n, o [m]) of a cloud, best first, and their
+    scores (p,).
 
     On a table, the search tries only vertical planes. A plane perpendicular to the best one is
     added if none was found near it. Its mirror images are hidden, so that the cloud cannot confirm
@@ -325,12 +332,12 @@ def find_plane_through_axis(
     center: Float[Tensor, "2"],
     part: Points,
 ) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
-    """Return (plane, score) of the mirror plane (n, o [m]) of a part attached to a body of
+    """Return (plane, score): the mirror plane (n, o [m]) of a part attached to a body of
     revolution.
 
-    The part may be a handle, with the points `part` (n, 3) [m]. The plane contains the vertical
-    axis at `center` (x, y) [m]. A plane across which the part extends less is preferred, even if
-    half of the part is hidden.
+    The part may be a handle, with the points `part` (n, 3) [m]. The plane contains the body's axis,
+    which is along z at `center` (x, y) [m]. `scorer` judges the planes. A plane across which the
+    part extends less is preferred, even if half of the part is hidden.
     """
     normals = _level_directions(SEARCH.level_through_axis)
     level = normals[:, :2]
@@ -349,10 +356,12 @@ def planes_near(
     angles: Float[Tensor, "t"],
     shifts: Float[Tensor, "s"],
 ) -> Mirrors:
-    """Return the planes near a plane (n, o [m]) for all combinations of t angles and s shifts.
+    """Return the planes (n, o [m]) near a given `plane`, for all combinations of t angles and s
+    shifts.
 
-    The plane is rotated by `angles` [rad], about z only if the scorer is upright. It is shifted by
-    `shifts` [m] along its normal.
+    The plane is rotated by `angles` [rad], about z if the scorer is upright, else about two axes in
+    it. The cloud's centre stays at the same distance from it. Then it is shifted by `shifts` [m]
+    along its normal.
     """
     normal = plane[:3]
     if scorer.upright:

@@ -145,12 +145,13 @@ def find_vessel(
     normals: Points,
     numbers: VesselNumbers = VESSEL,
 ) -> Vessel | None:
-    """Return the open vessel that a cloud shows, or None if it shows no vessel.
+    """Return the open vessel, such as a cup, that a cloud shows, or None if it shows none.
 
     `points` (n, 3) [m] and outward unit `normals` (n, 3) are in a frame with z up. Normals of an
     inner wall point to the axis. Both walls are fitted at once. The outer radius is a cubic
     polynomial of the height. The inner radius is less by the thickness over the length of the
-    normal's horizontal part. Robust weights (Cauchy) ignore handles.
+    normal's horizontal part. Robust weights (Cauchy) ignore handles. `numbers` are the bounds that
+    a vessel must meet.
     """
     height = points[:, 2]
     slope = norm(normals[:, :2])
@@ -242,7 +243,8 @@ def complete_walls(
     outline: Outlines,
     table: float,
 ) -> tuple[Wall, Wall]:
-    """Return (outer, inner): the two walls of a vessel on a table, each seen and hidden.
+    """Return (outer, inner): the two walls of a vessel on a table, with their seen and hidden
+    points.
 
     Args:
         cloud: the cloud [m] with normals, z up.
@@ -280,7 +282,7 @@ def complete_walls(
 
 
 def lid(vessel: Vessel) -> HiddenWall:
-    """Return points on an imagined flat lid that closes a vessel's outer surface at its rim."""
+    """Return 7 points on an imagined flat lid that closes a vessel's outer surface at its rim."""
     return _disc(vessel, vessel.rim, vessel.radius, WALL.lid_rings)
 
 
