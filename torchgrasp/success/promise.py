@@ -37,10 +37,11 @@ class Promise(NamedTuple):
 
 @functools.cache
 def find_promise(share: float) -> Promise | None:
-    """Return the least bound of the predicted success above which at least a `share`, in [0, 1], of
-    the grasps holds.
+    """Return the least bound of the predicted success above which at least a `share` of the grasps
+    holds.
 
-    The trials of the shipped success model support it. None means that they support no bound.
+    `share` is in [0, 1]. The trials of the shipped success model support it. None means that they
+    support no bound.
     """
     log_odds, held, family = load_success_model().kept.unbind(1)
     least = least_log_odds(log_odds, held > 0, family.long(), share)
