@@ -85,10 +85,10 @@ def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Te
 
 
 def scaled_arms(points: Vectors) -> Vectors:
-    """Return the vectors (b, f, 3) from the centroid of each contact set to its points, divided by
-    the set's root-mean-square radius.
+    """Return the vectors (b, f, 3) from the centroid of each contact set to its points, scaled to a
+    root-mean-square length of 1.
 
-    They have no unit, and a root-mean-square length of 1.
+    They have no unit: they are divided by the set's root-mean-square radius.
     """
     centre, radius = centre_and_radius(points)
     return (points - centre) / radius

@@ -34,7 +34,8 @@ from torchgrasp.values.specs import ContactSpec
 class Resisted(NamedTuple):
     """The greatest multiple of the worst load that each of b contact sets resists.
 
-    `twist` proves that no greater multiple is possible.
+    All vectors are in the frame of the contacts. `twist` proves that no greater multiple is
+    possible.
 
     Args:
         margin: the greatest multiple s (no unit) of the load that the contacts resist; 0 if it is

@@ -111,6 +111,9 @@ class LinearConstraints(Linearisation):
 class Descent(Minimisation[State, LinearConstraints]):
     """The minimisation problem of one solver stage: half the sum of the squared weighted
     constraints of each contact set.
+
+    In shapes, a counts the contact sets that still go on. u counts the unknowns of a set: the
+    coordinates of its contacts, then the tensions of the pairs.
     """
 
     shape: ShapeLike  # the estimated surface, or one for each contact set

@@ -115,7 +115,7 @@ class Attempts(Generic[Result]):
 
 
 def is_executable(grasps: Grasps) -> Bool[Tensor, "g"]:
-    """Return a mask of the grasps that passed every check (`Status.OK`)."""
+    """Return a mask (g,) of the grasps that passed every check: their `status` is `Status.OK`."""
     return grasps.status == Status.OK
 
 

@@ -146,11 +146,10 @@ class JointProblem:
         """Return all weighted residuals (g, k) of a `state`, then their Jacobian (g, k, d).
 
         First are the residuals of the hand (`grasp_residuals`). They are lengths [mm] and weighted
-        errors of the cosines between pads and surface.
-        Then follow those of the contacts, times 2 (`CONTACT_WEIGHT`) and the shape's scale [mm]. In
-        the shape k counts residuals, and d unknowns. The Jacobian is by hand pose (6), joints,
-        contacts and tensions. `flat` is the constraint that contacts are on flat surface; None
-        leaves it out.
+        errors of the cosines between pads and surface. Then follow the constraints on the contacts,
+        times 2 (`CONTACT_WEIGHT`) and the shape's scale [mm]. k counts residuals, and d unknowns.
+        The Jacobian is by hand pose (6), joints, contacts and tensions. `flat` is the constraint
+        that contacts are on flat surface; None leaves it out.
         """
         hand = self.hand
         shape = self.shape

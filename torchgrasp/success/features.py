@@ -92,8 +92,8 @@ def measure_grasps(
     task: GraspTask,
     lifted: bool,
 ) -> Float[Tensor, "c g k"]:
-    """Return the k features from which the success of g grasps in a task is predicted, for each of
-    c conditions.
+    """Return the k features that predict the success of g grasps in a task, for each of c
+    conditions.
 
     The features are in the order of the tuple `FEATURES`. The dict `CAUSES` gives their units;
     shares and logarithms have none. Body and grasps are in an upright frame; `body` is one object

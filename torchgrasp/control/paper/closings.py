@@ -153,7 +153,7 @@ class PositionClosing:
 
 class OpenLoopClosing:
     """Closing controller without sensors: the joints move from the pre-grasp to the grasp, then to
-    targets that press.
+    the squeeze. The squeeze is joint targets beyond the grasp, with which the fingers press.
     """
 
     palm = STILL  # displacement (3,) [m] of the palm from its planned pose: none
