@@ -274,10 +274,10 @@ def clearance_rows(
     are below the wanted ones.
 
     The first group is of clearances between links, of which 1 mm (`SELF_CLEARANCE`) is wanted. The
-    second is of those from object, obstacles and table, of which 4 mm (`CLEARANCE`) is wanted. A
-    larger clearance gives 0. The 8 (`HINGES`) smallest clearances of each kind enter. `spatial`
-    holds the kinematics of the hands. With `tips_touch` the fingertips may touch the object and the
-    table.
+    second is of those from object, obstacles and table, of which 4 mm (`CLEARANCE`) is wanted. It
+    is missing for an empty world. A larger clearance gives 0. The 8 (`HINGES`) smallest clearances
+    of each kind enter. `spatial` holds the kinematics of the hands. With `tips_touch` the
+    fingertips may touch the object and the table.
     """
     pairs = spatial.hand.self_collision
     moves = spatial.hand.motion.moves

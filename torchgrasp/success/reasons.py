@@ -181,8 +181,9 @@ def stand_upright(grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[Hand, Est
     """Return the hand, the estimated object and the grasps, the last two turned to an upright
     frame, with z up.
 
-    The `shape` of the object is in the frame of the grasps. Up is the table's normal of the grasps,
-    if they have a table. The hand is moved to the device and dtype of the grasps.
+    The `shape` of the object is in the frame of the grasps. Up is the normal of the grasps' table,
+    or without a table the direction to the camera. The hand is moved to the device and dtype of the
+    grasps.
     """
     frame = inverse(upright_frame(shape.cloud.points, shape.cloud.viewpoint, grasps.table))
     hand = hand.to(grasps.joints.device, grasps.joints.dtype)
