@@ -111,11 +111,11 @@ Slide = Float[Tensor, "b f 3 k"]
 
 
 def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
-    """Return the grasp matrix (6 x 3 f), which maps forces at f points to their total force and
-    torque.
+    """Return the grasp matrix (*b, 6, 3 f), which maps forces at f `points` to their total force
+    and torque.
 
     The n = 3 f columns are ordered by point, then by axis. The torque is about the centroid of the
-    points.
+    points, and has the unit of force times that of the points. `*b` stands for any leading axes.
     """
     arms = points - points.mean(-2, keepdim=True)
     force = eye_like(3, points).expand(*arms.shape, 3)
@@ -124,12 +124,12 @@ def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
 
 
 def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"]:
-    """Return for each of p pairs of contacts the opposite unit forces that pull the two contacts
-    together.
+    """Return for each of p pairs of contacts the two opposite unit forces that pull them together.
 
-    `points` holds sets of f contacts. `[..., k, i, :]` is the force on contact i by pair k, which
-    is 0 unless i belongs to the pair. Pairs of neighbours (i, i + 1) come first, then (i, i + 2).
-    The forces of all pairs span all balanced forces, except for four or five contacts in one plane.
+    `points` (*b, f, 3) hold sets of f contacts, and `*b` stands for any leading axes. `[..., k, i,
+    :]` is the force on contact i by pair k, which is 0 unless i belongs to the pair. Pairs of
+    neighbours (i, i + 1) come first, then (i, i + 2). The forces of all pairs span all balanced
+    forces, except for four or five contacts in one plane.
     """
     f = points.shape[-2]
     first, second = contact_pairs(f, points.device)
@@ -141,9 +141,10 @@ def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"
 def split_forces(
     forces: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*c f 3"]
 ) -> tuple[Float[Tensor, "*d f"], Float[Tensor, "*d f 3"]]:
-    """Return the normal parts of forces on an object, positive if they push, then the tangential
-    parts.
+    """Return the normal parts (*d, f) of `forces` on an object, then the tangential parts (*d, f,
+    3).
 
+    A normal part is positive if the force pushes. Forces, normals and results are in one frame.
     `normals` are the outward unit normals of the object where the forces act. The leading axes *b
     and *c are broadcast to *d.
     """

@@ -48,9 +48,11 @@ ON_SURFACE = 1e-6  # largest |f_d| of a contact on the surface, normalised: far 
 
 
 def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b f n 3"]:
-    """Return n unit tangents at each contact, at equal angles around its normal.
+    """Return n unit tangents (b, f, n, 3) of the surface at each contact, at equal angles around
+    its normal.
 
-    `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals.
+    They rotate with the contact set. `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the
+    outward unit normals.
     """
     return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
 
@@ -65,9 +67,10 @@ def normal_variation(
     """Return for each contact the largest angle [rad] between its normal and the normals on a ring
     around it.
 
-    `points` (b, f, 3) are normalised, `normals` (b, f, 3) unit vectors. The ring has the normalised
-    `radius`, one number, or one for each contact set. Contacts outside the mask `among` have
-    infinite angles; by default all are measured.
+    `points` (b, f, 3) are normalised contacts, `normals` (b, f, 3) their outward unit normals. The
+    ring has eight points on the surface. It has the normalised `radius`, one number, or one for
+    each contact set. Contacts outside the mask `among` have infinite angles; by default all are
+    measured.
     """
     variation = torch.full_like(points[..., 0], math.inf)
     among = torch.ones_like(variation, dtype=torch.bool) if among is None else among
@@ -100,10 +103,11 @@ class FlatnessConstraint(Batch):
     at: Vectors
 
     def values(self, points: Vectors) -> Float[Tensor, "b k"]:
-        """Return the k constraint values (normalised lengths) of each contact set at `points` near
-        `at`, by the linear model.
+        """Return the k constraint values (normalised lengths) of each contact set at other
+        `points`, by the linear model.
 
-        `points` (b, f, 3) are normalised.
+        `points` (b, f, 3) are normalised contacts. The model is good near those at which it was
+        built (`at`). A value <= 0 means that the surface is flat enough.
         """
         return self.value + matvec(self.by_points, (points - self.at).flatten(1))
 
@@ -210,7 +214,8 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
 
 
 def within(problem: ContactProblem, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-    """Return a mask of the normalised points that lie inside the region where contacts may be.
+    """Return a mask (*b) of the normalised `points` that lie inside the region where contacts may
+    be.
 
     `problem.beyond` is the signed distance from the region. Points within rounding (`BORDER`) of
     its surface are not inside. Without a region all points are inside.

@@ -68,10 +68,10 @@ def count_contacts(points: Float[Tensor, "*b f 3"]) -> int:
 
 
 def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
-    """Return the centroid and the root-mean-square radius of each contact set, in the unit of the
-    points.
+    """Return the centroid of each contact set, and its root-mean-square radius about the centroid,
+    in the unit of the points.
 
-    `points` have the shape (b, f, 3). The radius is 1 if it would be 0.
+    `points` have the shape (b, f, 3). Where all points of a set coincide, the radius is 1.
     """
     centre = points.mean(-2, keepdim=True)
     arms = points - centre
@@ -85,8 +85,10 @@ def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Te
 
 
 def scaled_arms(points: Vectors) -> Vectors:
-    """Return vectors (b, f, 3) from the centroid to the points, divided by the points'
-    root-mean-square radius.
+    """Return the vectors (b, f, 3) from the centroid of each contact set to its points, scaled to a
+    root-mean-square length of 1.
+
+    They have no unit: they are divided by the set's root-mean-square radius.
     """
     centre, radius = centre_and_radius(points)
     return (points - centre) / radius
@@ -132,10 +134,12 @@ def _take(vectors: Float[Tensor, "b f k 3"], index: Int[Tensor, "b f 1"]) -> Vec
 def cone_edges(
     normals: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"], friction: float, edges: int
 ) -> Float[Tensor, "*b e 3"]:
-    """Return the e edges of linearised friction cones: forces whose normal component is 1.
+    """Return the e = `edges` edges of linearised friction cones: forces on the object whose inward
+    normal component is 1.
 
-    `normals` are outward unit normals. The first edge leans along the unit `tangent`; `friction` is
-    the coefficient of friction.
+    `normals` are outward unit normals of the object. The first edge leans along the unit vector
+    `tangent`, and `friction` is the coefficient of friction. All vectors are in one frame. `*b`
+    stands for any leading axes.
     """
     edge = torch.arange(edges, dtype=normals.dtype, device=normals.device)
     angle = edge[:, None] * (2 * math.pi / edges)
@@ -161,17 +165,20 @@ def wrenches(
 
 
 def with_torque(force: Float[Tensor, "*b 3"], arm: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6"]:
-    """Return the wrench of each force: the force, then its torque, the cross product of `arm` and
-    `force`.
+    """Return the wrench (*b, 6) of each force: the force, then its torque, the cross product of
+    `arm` and `force`.
+
+    `arm` leads from the point about which the torque is to the contact.
     """
     return torch.cat([force, torch.linalg.cross(arm, force)], -1)
 
 
 def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
-    """Return the ratio of the smallest to the largest singular value of each contact set's wrench
-    matrix.
+    """Return the ratio (no unit) of the smallest to the largest singular value of each contact
+    set's wrench matrix.
 
-    The matrix (6 x f e) holds the wrenches of the e edges of f friction cones.
+    The matrix (6 x f e) holds the wrenches of the e edges of f friction cones. A ratio near 0 means
+    that the contacts resist loads in some direction badly, or not at all.
     """
     values = torch.linalg.svdvals(wrench.flatten(1, 2))
     return values[:, -1] / values[:, 0]
@@ -436,7 +443,8 @@ def most_opposing(
 
     A witness is a wrench that disproves force closure: its products with all contact wrenches are
     at least 0. The wrenches have normal force 1, and lengths are divided by the contacts'
-    root-mean-square radius. `points` and outward unit `normals` have the shape (b, f, 3).
+    root-mean-square radius. `points` and outward unit `normals` have the shape (b, f, 3), and
+    `friction` is the coefficient of friction. A negative product refutes the witness.
     """
     arm = scaled_arms(points)
     force, torque = witness[:, None].expand(*points.shape[:2], 6).split(3, -1)

@@ -269,11 +269,11 @@ def descend(
     state: "solver.State",
     stage: "solver.Stage",
 ) -> "solver.State":
-    """Return the solver's state after the Levenberg-Marquardt steps of one stage that begins with
-    `state`.
+    """Return the contact sets after the Levenberg-Marquardt steps of one solver stage that begins
+    with `state`.
 
-    `shape` is the surface, `problem` holds the constraints, and `stage` their weights and the
-    number of steps.
+    `shape` is the surface on which the contacts stay. `problem` holds the constraints, and `stage`
+    their weights and the greatest number of steps.
     """
     f = state.points.shape[1]
     pairs = constraint.contact_pairs(f, state.points.device)

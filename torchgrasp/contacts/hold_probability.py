@@ -424,8 +424,9 @@ def sensitivities(
     """Return the derivatives of the critical friction with respect to points [1/m] and normals (no
     unit).
 
-    They have the shape (b, f, 3), and only their parts along the surface. `points` [m] and outward
-    unit `normals` are in one frame. `balance` holds the contacts' forces of least friction.
+    They have the shape (b, f, 3), and are projected on the surface's tangent planes. `points` [m]
+    and outward unit `normals` are in one frame. `balance` holds the contacts' forces of least
+    friction.
     """
     _, radius = centre_and_radius(points)
     rotation = balance.twist[:, None, 3:].expand_as(points)
@@ -439,9 +440,11 @@ def sensitivities(
 def exceeding(
     law: Distribution, mean: Float[Tensor, "k"], deviation: Float[Tensor, "k"]
 ) -> Float[Tensor, "k"]:
-    """Return the probability that a number exceeds each of k Gaussian numbers, independent of it.
+    """Return the probability (k,) that a random number with the distribution `law` exceeds each of
+    k Gaussian numbers.
 
-    `law` is the distribution of the number. A Gaussian number of `deviation` 0 is its `mean`.
+    The two numbers are independent. The Gaussian numbers have the given `mean` (k,) and standard
+    `deviation` (k,). One with the deviation 0 is its mean.
     """
     ends = real(law.parts).to(mean)
     shares = real(law.shares).to(mean)

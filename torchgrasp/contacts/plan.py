@@ -94,10 +94,12 @@ def plan_contacts(
 
 
 def stages_for(spec: ContactSpec) -> tuple[Stage, ...]:
-    """Return the solver's stages (weights and numbers of steps) for random initial guesses.
+    """Return the stages of the contact solver for random initial guesses.
 
-    If `spec` demands a flat surface at contacts, one short stage does. Otherwise the stages are
-    those of a full search, as from any guess.
+    A stage is a number of steps with given weights of the constraints.
+
+    If `spec` demands a flat surface at contacts, the guesses are nearly feasible, and one stage of
+    8 steps does. Otherwise ten stages search from any guess.
     """
     return SEARCH if spec.flatness is None else TO_CENTRE
 
@@ -127,7 +129,8 @@ def plan_chunk(
     """Return the contact plan from initial guesses on the surface, one contact set for each guess.
 
     `problem` holds the constraints, and `first` (b, f, 3) the guesses in normalised units. `stages`
-    are the solver's stages before the last one, `FINISH`.
+    are the solver's stages before a last one that is the same for all (`FINISH`). Where the solver
+    fails from a guess that satisfies all constraints, the guess is the result.
     """
     state = start_state(shape, first)
     for stage in (*stages, FINISH):

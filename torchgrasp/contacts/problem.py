@@ -128,9 +128,9 @@ def device_of(shape: ShapeLike) -> torch.device:
 
 
 def rows_of(shape: AnyShape, rows: Int[Tensor, "k"]) -> AnyShape:
-    """Return the shapes of the k entries with the indices `rows`, from a batch of shapes.
+    """Return the shapes of some entries of a batch of shapes: those with the indices `rows` (k,).
 
-    A single shape, which belongs to all entries, is returned as it is.
+    A single shape, which belongs to all entries of a batch, is returned as it is.
     """
     return shape.rows(rows) if isinstance(shape, ShapeBatch) else shape  # pyright: ignore[reportReturnType]
 
@@ -157,9 +157,11 @@ def walls_at(shape: AnyShape, points: Vectors) -> list[tuple[AnyShape, Bool[Tens
 
 
 def triple_jet(shape: ShapeLike, points: Vectors) -> SurfaceJet:
-    """Return mean and variance of the signed distance, with their derivatives, at contacts.
+    """Return mean and variance of the signed distance at each contact, with their derivatives by
+    the contact's position.
 
-    `points` (b, f, 3) and the results are normalised; the results have the leading axes (b, f).
+    `points` (b, f, 3) and the results are normalised: one unit is `shape.scale` [m]. The fields of
+    the result have the leading axes (b, f).
     """
     jet = shape.jet(points.flatten(0, 1))
     return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), jet)
@@ -169,17 +171,19 @@ def variance_at(shape: ShapeLike, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]
     """Return the variance (q,) of the signed distance at q normalised points, in squared normalised
     units.
 
-    Its derivatives are not computed if possible.
+    A shape with a method `variance` computes it without its derivatives.
     """
     variance = getattr(shape, "variance", None)
     return shape.jet(x).variance if variance is None else variance(x)
 
 
 def triple_mean_jet(shape: ShapeLike, points: Vectors) -> MeanJet:
-    """Return the mean signed distance, its gradient and Hessian at contacts; the variance is not
-    computed if possible.
+    """Return the mean signed distance at each contact, with its gradient and Hessian by the
+    contact's position.
 
-    `points` (b, f, 3) and the results are normalised; the results have the leading axes (b, f).
+    `points` (b, f, 3) and the results are normalised: one unit is `shape.scale` [m]. The fields of
+    the result have the leading axes (b, f). A shape with a method `mean_jet` does not compute the
+    variance.
     """
     jet = getattr(shape, "mean_jet", shape.jet)(points.flatten(0, 1))
     values = jet.distance, jet.gradient, jet.hessian
@@ -188,10 +192,11 @@ def triple_mean_jet(shape: ShapeLike, points: Vectors) -> MeanJet:
 
 @functools.cache
 def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
-    """Return the indices of the two contacts of each of p pairs, for a number of fingertips.
+    """Return the indices (2, p) of the two contacts of each pair of f contacts, on a `device`.
 
-    The first row holds the first contacts, the second row the second ones. Neighbours (i, i + 1)
-    come first, then (i, i + 2).
+    f is the number of `fingertips`, and p = f (f - 1) / 2 that of the pairs. The first row holds
+    the first contact of each pair, the second row the second one. Neighbours (i, i + 1) come first,
+    then (i, i + 2), both modulo f.
     """
     order = [
         (i, (i + gap) % fingertips)
@@ -203,10 +208,10 @@ def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
 
 @functools.cache
 def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
-    """Return the signed incidence matrix of f contacts and their p = f (f - 1) / 2 pairs.
+    """Return the signed incidence matrix (f, p) of f contacts and their p pairs, on a `device`.
 
-    The pairs are in the order of `contact_pairs`. The sign is 1 where contact i is the first of
-    pair k. It is -1 where it is the second, else 0. `fingertips` is f.
+    Entry (i, k) is 1 where contact i is the first of pair k, -1 where it is the second, else 0. The
+    pairs are in the order of `contact_pairs`, and f is the number of `fingertips`.
     """
     pairs = contact_pairs(fingertips, device)
     at = torch.arange(fingertips, device=device)[:, None]
@@ -214,10 +219,10 @@ def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
 
 
 def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Tensions]:
-    """Return the two parts of vectors of u unknowns: contact points, and tensions of pairs of
-    contacts.
+    """Return the contact points (b, f, 3), then the tensions (b, p) of the pairs of contacts.
 
-    The points have the shape (b, f, 3), the tensions (b, p). Both are views of `x`.
+    Both are views of `x`. Each of its b vectors of unknowns holds 3 f coordinates, then p tensions;
+    f follows from the length u.
     """
     # the unknowns of the possible numbers of fingertips
     counts = {3 * f + f * (f - 1) // 2: f for f in range(FINGERTIPS[0], FINGERTIPS[1] + 1)}
@@ -299,17 +304,21 @@ class Face(NamedTuple):
         return cls(outward, float(shape.normalise(foot) @ plane.normal))
 
     def rows(self, index: Int[Tensor, "k"]) -> "Face":
-        """Return the face in normalised units of the k contact sets with the indices `index`."""
+        """Return the face for some contact sets of a batch, in the units of their shapes: those
+        with the indices `index` (k,).
+        """
         offset = self.offset
         return Face(self.outward, offset[index]) if isinstance(offset, Tensor) else self
 
     def room(
         self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], tip_radius: PerRow
     ) -> Float[Tensor, "*b"]:
-        """Return how far (normalised) the round fingertip on each contact is outside the face.
+        """Return the distance (*b), normalised, of the round fingertip on each contact from the
+        face.
 
         It is negative where the fingertip reaches through the face. `points` are normalised
-        contacts, `normals` their outward unit normals. `tip_radius` is normalised.
+        contacts, `normals` their outward unit normals. `tip_radius` is normalised. `*b` stands for
+        any leading axes.
         """
         away = self.outward.to(points)
         height = points @ away
@@ -344,10 +353,11 @@ class ContactProblem:
     def of(
         cls, shape: ShapeLike, spec: ContactSpec, ring_radius: PerRow | None = None
     ) -> "ContactProblem":
-        """Return the problem of a shape and the constraints `spec`.
+        """Return the problem of finding contacts on a `shape` under the constraints `spec`, in the
+        shape's normalised units.
 
-        `ring_radius` [m] is the radius within which the surface must be flat; by default that of
-        the spec.
+        `ring_radius` [m] is the radius around a contact within which the surface must be flat. None
+        means that of the spec.
         """
         sizes = shape.scale, shape.domain_radius
         scale, radius = (x if isinstance(x, Tensor) else float(x) for x in sizes)
@@ -372,7 +382,10 @@ class ContactProblem:
         )
 
     def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
-        """Return the problem of the k contact sets with the indices `index` in the batch."""
+        """Return the problem of some contact sets of a batch: those with the indices `index` (k,).
+
+        A problem of one shape for all contact sets is returned as it is.
+        """
         names = "domain_radius", "separation", "tip_radius", "ring"
         own = {name: x[index] for name in names if isinstance(x := getattr(self, name), Tensor)}
         if not own:  # of one shape for all contact sets
@@ -383,12 +396,12 @@ class ContactProblem:
     def room(
         self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]
     ) -> Float[Tensor, "*b"]:
-        """Return how high (normalised) each contact is above the height at which its round
+        """Return how far (*b), normalised, each contact is above the height at which its round
         fingertip touches the table.
 
-        Without a table it is infinite. A fingertip beyond the table's edge may be lower: then the
-        result is how far it is beyond the edge. `points` are normalised, `normals` outward unit
-        normals.
+        It is negative where the fingertip would be in the table. Without a table it is infinite. A
+        fingertip beyond the table's edge may be lower: then the result is how far it is beyond the
+        edge. `points` are normalised, `normals` outward unit normals.
         """
         rooms = [face.room(points, normals, self.tip_radius) for face in self.table]
         if not rooms:
@@ -417,10 +430,11 @@ class ContactProblem:
     def sides(
         self, points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]
     ) -> Float[Tensor, "*b p 3"]:
-        """Return the vectors (normalised) from the first to the second fingertip centre of each
-        pair of contacts.
+        """Return the vectors (*b, p, 3), normalised, from the first to the second fingertip centre
+        of each pair of contacts.
 
-        `points` are normalised contacts, `normals` their outward unit normals.
+        The p pairs are in the order of `contact_pairs`. `points` are normalised contacts, `normals`
+        their outward unit normals.
         """
         centres = points + spread(self.tip_radius, normals) * normals
         first, second = contact_pairs(points.shape[-2], points.device)

@@ -191,10 +191,11 @@ class Region(Value):
 def combine(
     keep: Distance | None, avoid: Distance | None, also: Distance | None = None
 ) -> Distance | None:
-    """Return the region inside `keep` and `also` and outside `avoid`; None if all three are None.
+    """Return the region that is inside `keep` and `also`, and outside `avoid`; None if all three
+    are None.
 
-    Each is a function of points (n, 3) [m] in one frame, or None. It returns their signed distances
-    (n,) [m], negative inside.
+    The three and the result are functions of points (n, 3) [m] in one frame. They return signed
+    distances (n,) [m] from a region, negative inside it. None sets no limit.
     """
     named = ("keep", keep, 1), ("spec.region", also, 1), ("avoid", avoid, -1)
     parts = [
@@ -208,10 +209,11 @@ def combine(
 
 
 def seen_from(region: Distance | None, obj_from_frame: Float[Tensor, "4 4"]) -> Distance | None:
-    """Return the signed distance [m] from a region as a function of points [m] in another frame.
+    """Return the signed distance [m] from a `region` as a function of points in another frame.
 
-    `region` takes points in the frame `obj`, and `obj_from_frame` [m] is the transform from the
-    other frame. None stays None.
+    Such a function takes points (n, 3) [m] and returns signed distances (n,) [m], negative inside.
+    `region` is one of points in the frame `obj`. `obj_from_frame` (4, 4) [m] is the pose of the
+    other frame in `obj`. If `region` is None, the result is None.
     """
     if region is None:
         return None

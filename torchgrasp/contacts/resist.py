@@ -34,7 +34,8 @@ from torchgrasp.values.specs import ContactSpec
 class Resisted(NamedTuple):
     """The greatest multiple of the worst load that each of b contact sets resists.
 
-    `twist` proves that no greater multiple is possible.
+    All vectors are in the frame of the contacts. `twist` proves that no greater multiple is
+    possible.
 
     Args:
         margin: the greatest multiple s (no unit) of the load that the contacts resist; 0 if it is
@@ -60,11 +61,12 @@ def resist_loads(
 ) -> Resisted:
     """Return the greatest multiple of the worst of w loads that each of b contact sets resists.
 
-    The worst load is the one with the least such multiple.
+    The worst load is the one with the least such multiple. The contact forces are within the
+    friction cones, and no finger exceeds its `strength`.
 
     Args:
-        points: contacts [m] (b, f, 3).
-        normals: outward unit normals (b, f, 3).
+        points: contacts (b, f, 3) [m].
+        normals: outward unit normals (b, f, 3) of the object, in the same frame.
         strength: greatest normal force [N] of each contact.
         loads: w loads of each set: force [N], then torque [N m] about the origin of the points'
             frame.
@@ -95,7 +97,10 @@ def share_carried(
     load: Float[Tensor, "b 6"],
     spec: ContactSpec,
 ) -> Float[Tensor, "b"]:
-    """Return which share, at most 1, of a load each of b contact sets can carry.
+    """Return the share (b,) of a load that each of b contact sets can balance, at most 1.
+
+    The contact forces are within the friction cones, and no finger exceeds its `strength`. The
+    share is 0 where none is proven.
 
     Args:
         contacts: b sets of f contacts [m] with outward unit normals.

@@ -111,6 +111,9 @@ class LinearConstraints(Linearisation):
 class Descent(Minimisation[State, LinearConstraints]):
     """The minimisation problem of one solver stage: half the sum of the squared weighted
     constraints of each contact set.
+
+    In shapes, a counts the contact sets that still go on. u counts the unknowns of a set: the
+    coordinates of its contacts, then the tensions of the pairs.
     """
 
     shape: ShapeLike  # the estimated surface, or one for each contact set
@@ -206,17 +209,20 @@ class Descent(Minimisation[State, LinearConstraints]):
 
 
 def promised_decrease(model: LinearConstraints, x: Step) -> Float[Tensor, "a"]:
-    """Return the decrease (a,) of each contact set's cost that its linear model predicts for the
+    """Return the decrease (a,) of each contact set's cost that its linear `model` predicts for the
     step `x` (a, u).
+
+    The cost is half the sum of the squared weighted constraints.
     """
     linear = model.residual + matvec(model.weighted_jacobian, x)
     return (model.residual.square().sum(1) - linear.square().sum(1)) / 2
 
 
 def descend(shape: ShapeLike, problem: ContactProblem, state: State, stage: Stage) -> State:
-    """Return the solver's state after one stage that begins with `state`.
+    """Return the contact sets after one stage of the contact solver that begins with `state`.
 
-    `problem` holds the constraints, and `stage` their weights and the number of steps.
+    The stage makes Levenberg-Marquardt steps along the surface of `shape`. `problem` holds the
+    constraints, and `stage` their weights and the greatest number of steps.
     """
     if not stage.exact and _is_fused(shape, problem, state):
         from torchgrasp.contacts import fused_descent  # it imports numba

@@ -76,8 +76,9 @@ def given_starts(shape: ShapeLike, starts: Vectors) -> Iterator[Float[Tensor, "_
 
 
 def start_chunks(starts: int) -> list[int]:
-    """Return the sizes of the chunks in which `starts` initial guesses are planned: 500, the last
-    one fewer.
+    """Return the sizes of the chunks in which a number `starts` of initial guesses is planned.
+
+    Each is 500 but the last, which has what is left.
     """
     return [min(STARTS_PER_CHUNK, starts - begin) for begin in range(0, starts, STARTS_PER_CHUNK)]
 
@@ -85,8 +86,9 @@ def start_chunks(starts: int) -> list[int]:
 class FlatCandidates(NamedTuple):
     """Constraints with a known `flat_radius`, and p candidate contacts where the surface is flat.
 
-    `spec` holds the constraints. `candidates` are the normalised points (p, 3), and the outward
-    unit normals (p, 3) there. They are None if the surface need not be flat.
+    The `flat_radius` [m] is the radius around a contact within which it must be flat. `spec` holds
+    the constraints. `candidates` are the normalised points (p, 3), and the outward unit normals (p,
+    3) there. They are None if the surface need not be flat.
     """
 
     spec: ContactSpec
@@ -99,9 +101,9 @@ def drawn_starts(
     """Yield random initial guesses on the surface in normalised units, `sizes[k]` contact sets at a
     time.
 
-    Without flatness in the spec of `settled` the guesses are drawn as in the paper (Sec. 6.2). With
-    flatness they are sets of its candidate contacts, whose centroid may lie far from the object's
-    centre.
+    If the spec of `settled` demands no flat surface, the guesses are drawn as in the paper (Sec.
+    6.2): on a sphere, then moved onto the surface. Otherwise they are sets of the candidate
+    contacts of `settled`, whose centroid may lie far from the object's centre. `seed` draws them.
     """
     spec, candidates = settled
     generator = torch.Generator().manual_seed(seed)
@@ -152,8 +154,8 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
 def draw(
     shape: ShapeLike, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator
 ) -> Float[Tensor, "_ f 3"]:
-    """Return random contact sets on the sphere around the origin with radius `spec.start_radius`,
-    in normalised units.
+    """Return random contact sets on a sphere about the normalised origin, with the normalised
+    radius `spec.start_radius`.
 
     `size` holds the number of contact sets and the number of contacts in each. `generator` draws
     the points.
@@ -165,7 +167,8 @@ def draw(
 def survey(
     shape: ShapeLike, spec: ContactSpec, generator: torch.Generator
 ) -> Float[Tensor, "_ f 3"]:
-    """Return points (normalised) all over the surface, from which candidates are chosen.
+    """Return random points (normalised) all over the surface, from which candidate contacts are
+    chosen.
 
     They come in sets of f = 3 points. For a vessel, half of them are on each wall. `generator`
     draws them.
@@ -200,9 +203,10 @@ def qualify(
     """Return a mask of the points at which a contact may lie, and the surface's normals at all
     points.
 
-    `points` (b, f, 3) are normalised; the normals are outward unit vectors. A contact may lie on
-    the surface, where its variance is below `spec.max_variance`. It must also be above the table
-    and in the region of `spec`. The shape is known in a ball, which must contain it.
+    `points` (b, f, 3) are normalised; the normals are outward unit vectors. A point must meet five
+    conditions. It is on the surface (to 1e-4), and inside the ball in which the shape is known. The
+    variance there is below `spec.max_variance`. It is in the region of `spec`, and its fingertip is
+    above the table.
     """
     problem = ContactProblem.of(shape, spec)
     distance, gradient = (
@@ -224,11 +228,12 @@ def candidate_rows(
     starts: int,
     generator: torch.Generator,
 ) -> Vectors:
-    """Return b = `starts` random sets (b, f, 3) of candidate contacts, normalised.
+    """Return b = `starts` random sets (b, f, 3) of candidate contacts, normalised, as initial
+    guesses.
 
     They have force closure, and contacts far enough from each other, as `problem` demands. If too
-    few of the drawn sets are so, the rest are any candidates. `points` (p, 3) are the normalised
-    candidates, `normals` (p, 3) their outward unit normals. `generator` draws the sets.
+    few drawn sets are like this, the others are random sets of candidates. `points` (p, 3) are the
+    normalised candidates, `normals` (p, 3) their outward unit normals. `generator` draws the sets.
     """
     rows = []
     missing = starts

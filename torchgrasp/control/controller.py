@@ -170,7 +170,9 @@ class GraspController:
 
     @property
     def targets(self) -> Targets:
-        """The present `Targets`, which the last `step` returned, in tensors of their own."""
+        """The present `Targets`, those that the last `step` returned, in new tensors, which the
+        receiver may change.
+        """
         return self._sent.copied()
 
     @property

@@ -141,7 +141,7 @@ class DragController:
 
     @property
     def targets(self) -> Targets:
-        """The present targets, in tensors of their own."""
+        """The present `Targets` of joints and palm, in new tensors that the receiver may change."""
         palm = self.height * self.up + smooth_step(self.share)[0] * self.way + self.lag
         return Targets(self.joints, palm).copied()
 

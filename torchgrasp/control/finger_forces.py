@@ -75,10 +75,11 @@ def desired_forces(
     (`least_friction_forces`).
 
     `points` [m] and outward unit `normals` are those of the f contacts, in any frame. The forces
-    are in the same frame. The largest normal force is `strongest` [N]. `preferred` holds wanted
-    normal forces of the fingers, of which only the ratios count; None means equal ones. Where no
-    balanced forces press at every contact, each force is `strongest` along the inward normal. `*b`
-    stands for any leading axes.
+    are in the same frame. Balanced forces exert no wrench. The friction that they need is the
+    largest ratio of a tangential to a normal force. The largest normal force is `strongest` [N].
+    `preferred` holds wanted normal forces of the fingers, of which only the ratios count; None
+    means equal ones. Where no balanced forces press at every contact, each force is `strongest`
+    along the inward normal. `*b` stands for any leading axes.
     """
     balanced = least_friction_forces(points, normals, strongest, preferred)
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
@@ -156,8 +157,9 @@ def check_same_hand(hand: Hand, grasps: Grasps) -> None:
     """Raise `BadArgument` if `grasps` were planned for another hand than `hand`.
 
     The names of hand, fingers and joints in `grasps.meta` must be those of `hand`. Where
-    `grasps.meta` lacks the names, only the numbers of fingers and joints are compared. If the files
-    of the hand have changed since the plan, its fingertips must still reach the planned contacts.
+    `grasps.meta` lacks the names, only the numbers of fingers and joints are compared. The
+    fingertips must also reach the contacts as well as planned: the hand's geometry may have
+    changed. Normals that are no unit vectors or point inwards are refused, too.
     """
     planned = grasps.meta.get("hand", hand.name)
     if planned != hand.name:

@@ -195,7 +195,10 @@ class LoadEstimate:
             self.weighed = self.weighed + (load[:3] - self.weighed) / self.weighings
 
     def turn(self, up: np.ndarray) -> None:
-        """Take the unit vector `up` (3,) of a hand that has turned; a weighing then begins anew."""
+        """Take the unit vector `up` (3,), which points up in the frame of a hand that has turned.
+
+        If the hand has turned by more than 0.05 rad (`LOAD.turned`), the weighing begins anew.
+        """
         self.up = up
         if self.level is None or float(up @ self.level) < math.cos(LOAD.turned):
             self.level = up
@@ -206,7 +209,9 @@ class LoadEstimate:
         """Return whether the object is lifted, and its load has not grown for 0.3 s
         (`LOAD.steady`).
 
-        Call it once in each control period of `period` [s]: the call adds this time.
+        It is lifted at a force of 0.35 N or more (`LOAD.lifted`). The load grows where it exceeds
+        1.05 times the largest load so far. Call it once in each control period of `period` [s]: the
+        call adds this time.
         """
         if self.weight > LOAD.growth * self.most:
             self.most = self.weight
@@ -218,7 +223,7 @@ class LoadEstimate:
 
     @property
     def weight(self) -> float:
-        """Size [N] of the force in the low-passed load (`wrench`) on the fingertips."""
+        """Magnitude [N] of the force in the low-passed load (`wrench`) on the fingertips."""
         return float(np.linalg.norm(self.wrench[:3]))
 
     @property
@@ -237,7 +242,7 @@ class LoadEstimate:
     @property
     def exceeded(self) -> Distribution:
         """The `Distribution` of the mass [kg] of an object that is heavier than the largest load so
-        far.
+        far: from that load's mass, less its error, to 10 kg (`WEIGHT.most`).
         """
         carried = (1 - WEIGHT.sure * WEIGHT.share) * self.most / GRAVITY
         return Distribution.between(min(carried, WEIGHT.most), WEIGHT.most)

@@ -116,11 +116,11 @@ class ForceHold:
 def keep_targets(
     reference: ClosingReference, observation: Observation, start: Tensor
 ) -> Callable[..., Tensor]:
-    """Return a hold controller that always returns `start`, the joint targets (j,) [rad].
+    """Return a hold controller that always returns `start`, the joint targets (j,) [rad] at the end
+    of the closing.
 
-    They are those at the end of the closing. The controller is a function of an observation and a
-    period [s], as `Step`. `reference` and `observation`, which other hold controllers need, are not
-    used.
+    The controller is a function of an observation and a period [s]. `reference` and `observation`
+    are not used; other hold controllers need them.
     """
     return lambda observation, period: start
 
@@ -215,7 +215,7 @@ class GripHold:
 
     @property
     def weight(self) -> float:
-        """Size [N] of the filtered force with which the object loads the fingertips."""
+        """Magnitude [N] of the low-passed force with which the object loads the fingertips."""
         return self.load.weight
 
     @property
@@ -229,8 +229,9 @@ class GripHold:
 
     @property
     def sliding(self) -> np.ndarray:
-        """Mask (f,) of the fingers that have slid long enough for the filtered forces to show the
-        friction.
+        """Mask (f,) of the fingers that have slid for more than 0.03 s (`GRIP.slide`).
+
+        The filtered forces of these fingers show the friction.
         """
         return self.slid > GRIP.slide
 

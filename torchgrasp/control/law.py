@@ -33,12 +33,11 @@ MAX_STEP = 0.05
 def surface_covariance(
     normals: Float[Tensor, "*b 3"], std_m: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the covariance [m^2] of each contact's position in the closing "uncertainty": n n^T
-    s^2 + floor^2 I.
+    """Return the covariance [m^2] of each contact's position in the closing mode "uncertainty".
 
-    n is the contact's normal, from `normals`, and s its standard deviation `std_m` [m]. The floor
-    of 5 mm (`POSITION_FLOOR`) covers the hand's own errors, which are equal in all directions. `*b`
-    stands for any leading axes.
+    It is n n^T s^2 + floor^2 I. Here n is the contact's normal, from `normals`, and s its standard
+    deviation `std_m` [m]. The floor of 5 mm (`POSITION_FLOOR`) covers the hand's own errors, which
+    are equal in all directions. `*b` stands for any leading axes.
     """
     return _normal_covariance(normals, std_m, POSITION_FLOOR)
 
@@ -46,7 +45,8 @@ def surface_covariance(
 def printed_covariance(
     normals: Float[Tensor, "*b 3"], distance_variance: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the covariance [m^2] that Eq. (27) of the paper prints: Sigma_cov = diag(|R f_cov n|).
+    """Return the covariance [m^2] of each contact's position that Eq. (27) of the paper prints:
+    Sigma_cov = diag(|R f_cov n|).
 
     `distance_variance` [m^2] is f_cov, the variance of the signed distance. `normals` are R n, in
     the hand's frame. A normal across an axis makes Sigma_cov singular. So each diagonal entry is at
@@ -191,15 +191,15 @@ def joint_step(
     fingertips with a `velocity` [m/s].
 
     Damped least squares over all fingers replace the inverse Jacobian in Eq. (25) of the paper,
-    which coupled fingers lack. No joint changes by more than 0.05 rad (`MAX_STEP`). `*b` stands for
-    any leading axes.
+    which coupled fingers lack. If a joint would change by more than 0.05 rad (`MAX_STEP`), all
+    changes are scaled down by one factor. `*b` stands for any leading axes.
 
     Args:
         jacobian: Jacobian [m/rad] of the f fingertips with respect to the h actuated joints.
         velocity: commanded velocity [m/s] of each fingertip, in the frame of the Jacobian.
         period: control period [s].
-        posture_error: planned minus present joints [rad]. The motions that leave the fingertips at
-            rest reduce it; None means that there are no such motions.
+        posture_error: planned minus present joints [rad]. Joint motions that leave the fingertips
+            at rest reduce it. None means that no such motion is added.
         damping: damping of the inverse [m^2].
     """
     stacked = jacobian.flatten(-3, -2)

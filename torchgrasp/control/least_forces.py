@@ -40,11 +40,12 @@ class BarrierNumbers:
     With a larger one the forces stay farther from the borders of the cones.
     """
     growth: float = 0.02
-    """Least multiple of the internal forces that is tried besides 0; each later one is twice the
-    one before.
+    """Least multiple of the solver's internal forces `start` that is tried besides 0. It is added
+    to the last forces, which may be too small for the load. Each later multiple is twice the one
+    before.
     """
     growths: int = 9
-    """Number of these multiples."""
+    """Number of these multiples that are tried."""
     margin: float = 1.25
     """Least ratio of the friction coefficient to that which the internal forces need: below it the
     forces would grow huge.
@@ -78,11 +79,12 @@ BARRIER = BarrierNumbers()
 class Balance(NamedTuple):
     """The grasp map of f contacts, with its pseudo-inverse and null space.
 
-    `wrench` maps the n = 3 f components of the forces on the object to force and torque. The torque
-    is about the contacts' centroid [m]. `wrench` has no unit in the first three lines, and [m] in
-    the others. The columns of `inverse` are the least forces for each component of the wrench. The
-    columns of `free` are an orthonormal basis of the null space: k internal forces, which exert no
-    wrench. The columns of `wrench` are 0 for a finger in the air, so its force is free, too.
+    `wrench` maps the n = 3 f components [N] of the contact forces on the object to a wrench. This
+    is a force [N], then a torque [N m] about the contacts' centroid, in the frame of the forces.
+    `wrench` has no unit in the first three lines, and [m] in the others. The columns of `inverse`
+    are the least forces for each component of the wrench. The columns of `free` are an orthonormal
+    basis of the null space: k internal forces, which exert no wrench. The columns of `wrench` are 0
+    for a finger in the air, so its force is free, too.
     """
 
     wrench: Float[Array, "6 n"]
@@ -90,7 +92,9 @@ class Balance(NamedTuple):
     free: Float[Array, "n k"]
 
     def inner(self, forces: Float[Array, "f 3"]) -> Float[Array, "f 3"]:
-        """Return the part [N] of fingertip `forces` [N] that exerts no wrench."""
+        """Return the internal part (f, 3) [N] of contact `forces` [N]: their projection on the null
+        space, which exerts no wrench.
+        """
         return (self.free @ (self.free.T @ forces.ravel())).reshape(-1, 3)
 
 
@@ -148,12 +152,13 @@ class LeastForces:
         floor: Float[Array, "f"],
         reserve: Float[Array, "f"] | float = 0.0,
     ) -> Float[Array, "f 3"]:
-        """Return the least forces [N] on the object that exert the wrench `load`. All vectors are
-        in one frame.
+        """Return the contact forces (f, 3) [N] on the object that exert `load` with the least sum
+        of normal forces.
 
-        If no forces satisfy the constraints, the friction coefficient is raised to the least with
-        which forces were found. The coefficient is also at least 1.25 times the one that the
-        internal forces `start` need. Below it the forces would grow huge.
+        All vectors are in one frame. The forces are within the friction cones, and joint torques
+        near their limits cost extra. If no forces satisfy the constraints, the friction coefficient
+        is raised to the least with which forces were found. The coefficient is also at least 1.25
+        times the one that the internal part of `start` needs. Below it the forces would grow huge.
 
         Args:
             contacts: the grasp map.
@@ -162,8 +167,8 @@ class LeastForces:
             load: wrench [N, N m] that the forces exert on the object, about the contacts' centroid.
             friction: coefficient of friction.
             floor: least normal force [N] of each finger.
-            reserve: part of the normal force [N] that is not counted: the forces without it are
-                within the friction cones.
+            reserve: part of each normal force [N] that does not count for friction: the forces are
+                within their cones even without this part.
         """
         floor = np.maximum(floor, reserve)
         count = len(normals)

@@ -25,10 +25,11 @@ from torchgrasp.values.specs import ClosingMode, HoldingMode
 
 
 def choose_preference(hand: Hand, mode: ClosingMode) -> ForcePreference | None:
-    """Return the model by which a closing mode chooses among balanced forces; None if it has no
-    model.
+    """Return the model by which a closing mode chooses among balanced fingertip forces.
 
-    Raises `BadArgument` for the mode "paper" with a hand of other than three fingers.
+    It is the stability model in the hand's folder for the mode "paper". None for other modes, or a
+    hand without such a file. Raises `BadArgument` for the mode "paper" with a hand of other than
+    three fingers.
     """
     if mode != "paper":
         return None
@@ -39,10 +40,10 @@ def choose_preference(hand: Hand, mode: ClosingMode) -> ForcePreference | None:
 def make_closing(
     reference: ClosingReference, mode: ClosingMode, options: ClosingOptions
 ) -> Closing:
-    """Return the controller that closes the hand by the plan `reference`, for a closing mode such
-    as "paper".
+    """Return the controller of a closing mode, such as "paper", which closes the hand by the plan
+    `reference`.
 
-    `options` apply to the modes "fixed" and "uncertainty" only.
+    `options` apply to the modes "fixed" and "uncertainty" only; other modes ignore them.
     """
     match mode:
         case "open_loop":

@@ -158,10 +158,14 @@ class Touches:
     """Averages over time of the contact points and normals that a resting hand senses, in the
     planned hand's frame.
 
-    `known` marks fingertips with a working sensor, `felt` marks fingertips that touch and have
-    reported where. `links` (m, 4) holds centres and radii [m] of the collision spheres of links.
-    The joint torques show that one of these links touches the object. None means that no link has
-    touched it. If `kept`, fingertips that no longer touch are also in `felt`. f counts fingertips.
+    `known` (f,) marks fingertips with a working sensor, and `felt` (f,) those that touch and have
+    reported where. f counts fingertips.
+
+    Args:
+        reference: the closing plan.
+        links: centres and radii (m, 4) [m] of the collision spheres of links. The joint torques
+            show that one of these links touches the object. None means that no link has touched it.
+        kept: whether fingertips that no longer touch stay in `felt`.
     """
 
     def __init__(
@@ -206,8 +210,8 @@ class Touches:
         return (self.contact | self.kept) & (self.count > 0)
 
     def means(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-        """Return each fingertip's mean contact point [m], then its mean unit normal; both are 0
-        without a contact.
+        """Return each fingertip's mean contact point (f, 3) [m], then its mean outward unit normal
+        (f, 3). Both are in the planned hand's frame, and 0 without a contact.
         """
         return self.points / self.count.clamp_min(1)[:, None], unit(self.normals)
 

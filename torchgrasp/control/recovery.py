@@ -68,7 +68,7 @@ class GraspCheckNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class OpeningTimes:
-    """Times of `Reopening`, in which a hand opens again."""
+    """Times of `Reopening`, the controller that opens a hand again before another closing."""
 
     opening: float = 0.5
     """Time [s] in which the fingers open."""

@@ -200,7 +200,8 @@ class ClosingReference(Value):
 
     @checked
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
-        """Return the positions (j,) [rad or m] of all joints of the URDF.
+        """Return the positions (j,) [rad or m] of all joints of the URDF: actuated and coupled
+        ones.
 
         `actuated` (h,) [rad or m] are the actuated joints, in the order of `hand.joint_names`. The
         result is in the order of `hand.tree.joint_names`. A NaN gives NaN, where
@@ -267,12 +268,16 @@ class ClosingReference(Value):
 
 @dataclasses.dataclass(frozen=True)
 class PlanNumbers:
-    """Bounds on a closing plan whose parts are in different frames or units."""
+    """Bounds beyond which `check_plan` refuses a closing plan: its table or its surface is in
+    another frame or unit.
+    """
 
     tilt: float = 0.5
-    """Largest angle [rad] between the table and that of the plan: no measurement errs so much."""
+    """Largest angle [rad] between the plan's `table` and `planned_table`: no measurement errs so
+    much.
+    """
     off: float = 0.05
-    """Largest distance [m] between both tables at the contacts."""
+    """Largest distance [m] between these two tables at the planned contacts."""
     surface: float = 0.05
     """Largest median distance [m] of the planned contacts from the estimated surface."""
 
@@ -281,8 +286,15 @@ PLAN = PlanNumbers()
 
 
 def check_plan(reference: ClosingReference) -> None:
-    """Raise `BadArgument` for a closing plan whose parts do not fit together: drives of another
-    hand, vectors that are no unit vectors, a table or a surface in another frame.
+    """Raise `BadArgument` for a closing plan whose parts do not fit together.
+
+    It is refused in four cases:
+
+    * There is not one positive stiffness for each joint of the URDF.
+    * `normals` or `approach` are no unit vectors.
+    * `table` is tilted by more than 0.5 rad, or is more than 50 mm off, relative to
+      `planned_table`.
+    * The median distance of the planned contacts from `surface` exceeds 50 mm.
     """
     joints = len(reference.hand.tree.joint_names)
     if len(reference.kp) != joints or not bool((reference.kp > 0).all()):
@@ -327,11 +339,11 @@ def next_target(
     period: float,
     fastest: float = math.inf,
 ) -> Float[Tensor, " h"]:
-    """Return the targets [rad] of the h actuated joints after another control period, within the
-    joint limits.
+    """Return the targets (h,) [rad] of the actuated joints after another control period, which move
+    the fingertips with a `velocity`.
 
-    No target moves faster than `fastest`: all joints slow down together, so that the fingertips
-    keep their directions.
+    They are within the joint limits. No target moves faster than `fastest`: all joints slow down
+    together, so that the fingertips keep their directions.
 
     Args:
         reference: the closing plan.
@@ -339,7 +351,8 @@ def next_target(
         velocity: commanded velocity [m/s] of each of f fingertips, in the frame of the planned
             hand's root link.
         observation: the present observation.
-        lead: largest difference [rad] between a target and the measured joint.
+        lead: largest difference [rad] between a target and the measured joint: one for all joints,
+            or (h,).
         period: control period [s]: time to the next targets.
         fastest: largest speed [rad/s] of a target.
     """
@@ -416,8 +429,9 @@ def closing_gains(
             almost the least friction, those nearest to its preference are taken. None means that
             equal normal forces are preferred.
 
-    Raises `BadArgument` for more than one grasp, a grasp of another hand, contacts without `std_m`,
-    or a `force` out of range. `ClosingReference.from_grasp` lists all cases.
+    Raises `BadArgument` for more than one grasp, a grasp of another hand, or contacts without
+    `std_m`. Raises it for a `force` outside [0.01, 100] N, and in the other cases of
+    `ClosingReference.from_grasp`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

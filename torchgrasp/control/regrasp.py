@@ -55,10 +55,11 @@ def next_grasp(
     """Return the index in `grasps` of the grasp that most likely holds, after those with indices
     `tried` failed.
 
-    Only grasps that differ clearly from the tried ones count (`list_others`). `surface` is the
-    estimated surface of the object, in the frame of the grasps. The first of the other grasps is
-    returned in three cases: `surface` is None, the grasps have no table, or they are not ranked by
-    success. Raises `BadArgument` if no other grasp is left.
+    Only executable grasps count whose approach or contacts differ from the tried ones
+    (`list_others`). `surface` is the estimated surface of the object, in the frame of the grasps.
+    With it, a failure shifts the likely centre of mass, and so the chances of the others. The first
+    of the other grasps is returned in three cases: `surface` is None, the grasps have no table, or
+    they are not ranked by success. Raises `BadArgument` if no other grasp is left.
     """
     others = list_others(grasps, tried)
     if not len(others):
@@ -70,10 +71,12 @@ def next_grasp(
 
 @checked
 def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
-    """Return the indices (k,) of the executable grasps that differ from each grasp in `tried`.
+    """Return the indices (k,) in `grasps` of the executable grasps that differ from each grasp with
+    an index in `tried`.
 
-    Two grasps differ if their approaches are more than 30 degrees apart (`REGRASP.turn`). They also
-    differ if the mean distance of their contacts is more than 15 mm (`REGRASP.gap`).
+    A grasp is executable if its `status` is `OK`. Two grasps differ if their approaches are more
+    than 30 degrees apart (`REGRASP.turn`). They also differ if the mean distance of their contacts
+    is more than 15 mm (`REGRASP.gap`).
     """
     approach = grasps.approach
     points = grasps.contacts.points.double()

@@ -137,9 +137,12 @@ class DriveFeel:
     force (f,) [N] of each fingertip.
 
     The call takes an `Observation`, the targets (j,) [rad] of all joints, and the period [s] of
-    control. A blocked joint does not reach its target. A drive of stiffness k and damping d exerts
-    the torque k (target - q) - d dq/dt. Here q is the joint angle. f counts fingertips, and j all
-    joints of the URDF.
+    control. A drive of stiffness k and damping d exerts the torque k (target - q) - d dq/dt. Here q
+    is the joint angle. A joint that is blocked does not reach its target, so this torque shows the
+    force at its fingertip. f counts fingertips, and j all joints of the URDF.
+
+    Args:
+        reference: the closing plan, with the hand, its drives and the planned contact normals.
     """
 
     def __init__(self, reference: ClosingReference) -> None:

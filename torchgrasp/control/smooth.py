@@ -2,8 +2,8 @@
 
 
 def smooth_step(time: float) -> tuple[float, float]:
-    """Return (position, speed) of a motion from 0 to 1 that starts and ends at rest.
+    """Return (position, speed) at a `time` t of a motion from 0 to 1 that starts and ends at rest.
 
-    The `time` is in [0, 1]; all are without unit.
+    t runs from 0 to 1. The position is the cubic 3 t^2 - 2 t^3; nothing has a unit.
     """
     return time * time * (3 - 2 * time), 6 * time * (1 - time)

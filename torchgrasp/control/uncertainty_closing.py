@@ -95,8 +95,12 @@ class UncertaintyClosing:
       to the object.
     * A palm that starts above its planned pose (`ClosingReference.rise`) goes down while the
       fingers close. It goes down as far as the closing raises the fingertips on their arcs.
-    * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers
-      close.
+    * Three `ClosingOptions` act while the fingers close. With `wait`, fingers that touch wait for
+      the others. With `pose_estimate`, touches locate the object; up to `palm_reach`, the palm
+      follows.
+
+    The closing ends when all fingers have touched for 0.1 s (`SETTLED`). Without `wait` they must
+    also be under force control, with steady forces.
     """
 
     feels = True  # sensor readings change the targets
@@ -125,14 +129,19 @@ class UncertaintyClosing:
 
     @property
     def done(self) -> bool:
-        """Whether the closing has ended."""
+        """Whether the closing has ended: all fingers have touched for 0.1 s (`SETTLED`).
+
+        Without the option `wait`, they must also be under force control, with steady forces. With
+        it, the closing also ends 2.5 s after the first touch (`CLOSING.patience`).
+        """
         late = self.waits and self.waiting >= CLOSING.patience
         return late or self.settled.time >= SETTLED
 
     def begin_at(
         self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]
     ) -> "UncertaintyClosing":
-        """Return this controller, with another initial palm and expected object.
+        """Return this controller, set to begin with another position of the palm and another
+        expected pose of the object.
 
         `palm` [m] is the palm's displacement from its planned pose. `displacement` is the expected
         displacement of the object since the plan: the translation [m] of the contacts' centroid,
@@ -303,8 +312,9 @@ def rim_contacts(reference: ClosingReference) -> Bool[Tensor, "f"]:
     """Return a mask (f,) of the planned contacts on the upper rim of a low object.
 
     Their unit normals have a component above 0.25 along the table's normal (`RIM.slope`). The
-    fingertips that touch them are lower than 4 mm over the table (`RIM.near`). Fingertips farther
-    beyond the table's edge than above its plane do not count. Without a table there are none.
+    fingertips that touch them are lower than 4 mm over the table (`RIM.near`). A fingertip does not
+    count if it is farther beyond the table's edge than above the table's plane. Without a table the
+    mask is false.
     """
     table = reference.table
     if table is None:
@@ -335,8 +345,8 @@ def slide_along(
 
 
 def with_equal_gains(reference: ClosingReference) -> ClosingReference:
-    """Return the gains of the plan `reference`, changed so that they ignore the uncertainty: those
-    of the closing mode "fixed".
+    """Return the plan `reference` with gains that ignore the uncertainty: those of the closing mode
+    "fixed".
 
     All contacts have the covariance (5 mm)^2 I (`POSITION_FLOOR`) and the position gain 4 / s
     (`POSITION_RATE`). Each finger has its largest force gain on all axes.

@@ -46,12 +46,16 @@ def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
 
 
 class Attempts(Generic[Result]):
-    """The results of all refined initial guesses so far, and a mask of the contact sets without a
-    good one.
+    """A record of a grasp solver: the results of all refined initial guesses so far, and which
+    contact sets still lack a good one.
 
-    `unsolved` is this mask (b,) of the b contact sets. `solves` is a function of k results that
-    returns a mask (k,) of the good ones. `results` are the added groups of results, such as
-    `Grasps`. `rows` holds for each group the index of each result's contact set.
+    `unsolved` (b,) is the mask of these contact sets. `results` lists the added groups of results,
+    each of them a batch such as `Grasps`. For each group, `rows` holds the index (k,) of each
+    result's contact set.
+
+    Args:
+        unsolved: mask (b,) of the contact sets to solve at the start.
+        solves: function of a group of k results, which returns a mask (k,) of the good ones.
     """
 
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
@@ -61,16 +65,19 @@ class Attempts(Generic[Result]):
         self.rows = list[Tensor]()
 
     def add(self, results: Result, row: Int[Tensor, "k"]) -> None:
-        """Add k `results`; `row` holds the index of the contact set of each. The contact sets of
-        good results become solved.
+        """Add a group of k `results`, of which `row` (k,) holds the indices of the contact sets.
+
+        The contact sets of good results are no longer in `unsolved`.
         """
         self.results.append(results)
         self.rows.append(row)
         self.unsolved = self.unsolved.index_fill(0, row[self.solves(results)], False)
 
     def choose(self, seeds: IKSeeds, rank: Int[Tensor, "g"], first: int, count: int) -> IKSeeds:
-        """Return the initial guesses of unsolved contact sets whose `rank` within the set is from
-        `first` to `first + count - 1`.
+        """Return the initial guesses of unsolved contact sets whose `rank` is from `first` to
+        `first + count - 1`.
+
+        `rank` (g,) is the rank of each of the g guesses, from 0, among those of its contact set.
         """
         return seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]
 
@@ -95,11 +102,11 @@ class Attempts(Generic[Result]):
                 self.add(refine(chosen), chosen.row)
 
     def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
-        """Return the best result of each contact set that has results, t in all. Return then the
-        indices (t,) of these contact sets.
+        """Return the best result of each of the t contact sets with results, then the indices (t,)
+        of these sets.
 
-        `keys` returns tensors (k,) for k results. The best result has the least first key; in a tie
-        the next key decides.
+        `keys` is a function of k results, which returns tensors (k,) by which they are compared.
+        The best result has the least first key; in a tie the next key decides.
         """
         results = join(self.results)
         row = torch.cat(self.rows)
@@ -108,7 +115,7 @@ class Attempts(Generic[Result]):
 
 
 def is_executable(grasps: Grasps) -> Bool[Tensor, "g"]:
-    """Return a mask of the grasps that passed every check (`Status.OK`)."""
+    """Return a mask (g,) of the grasps that passed every check: their `status` is `Status.OK`."""
     return grasps.status == Status.OK
 
 
@@ -116,12 +123,12 @@ def best_grasps(
     attempts: Attempts[Grasps],
     worth: Callable[[Grasps], Float[Tensor, "k"]] = lambda grasps: grasps.score,
 ) -> tuple[Grasps, Int[Tensor, "t"]]:
-    """Return the best grasp of each contact set that has a grasp in `attempts`, t in all. Return
-    then the indices (t,) of these contact sets.
+    """Return the best grasp of each of the t contact sets with grasps in `attempts`, then their
+    indices (t,).
 
-    An executable grasp is best. Next is a failed grasp whose contacts violate no constraint, then
-    any other. In a tie the higher `worth` decides, a number (k,) of each of k grasps. It is the
-    `score` by default.
+    An executable grasp, which passed all checks, is best. Next is a failed grasp whose contacts
+    violate no constraint, then any other. In a tie the grasp of higher `worth` is better. `worth`
+    is a function of k grasps that returns numbers (k,), by default the `score`.
     """
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
@@ -133,18 +140,22 @@ def best_grasps(
 
 
 def best_first(grasps: Grasps) -> Grasps:
-    """Return grasps sorted: executable grasps before failed grasps, both by decreasing score."""
+    """Return the `grasps` sorted: executable ones (`Status.OK`) before failed ones, both by
+    decreasing score.
+    """
     return grasps[lexical_order((~is_executable(grasps)).int(), -grasps.score)]
 
 
 def refine_on_contacts(
     problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS, cobyla: bool = False
 ) -> Grasps:
-    """Return a checked grasp for each initial guess, refined on its fixed contacts.
+    """Return a checked grasp for each initial guess, refined until its fingertips are on its fixed
+    contacts.
 
-    The solver takes at most `steps` steps. `problem` holds the contact sets, of which `seeds.row`
-    holds indices. A grasp's `status` is that of the first check that it fails. With `cobyla`, the
-    paper's solver and checks are used, and `steps` is not used.
+    `problem` holds the contact sets, and `seeds.row` the index of each guess's set. A grasp's
+    `status` is that of the first check that it fails, or `OK`. The solver takes at most `steps`
+    Levenberg-Marquardt steps. With `cobyla`, the paper's solver and checks replace it, and `steps`
+    is not used.
     """
     contacts = assign(problem.contacts, seeds)
     start = Configuration(seeds.joints, seeds.obj_from_hand)
@@ -201,8 +212,8 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """Return a checked grasp on fixed contacts for each contact set with initial guesses (`seeds`),
     best grasp first.
 
-    The two guesses of each set with the least cost (`seed_costs`) are refined. If both fail, the
-    next four are refined.
+    Guesses whose hand pose an arm cannot reach are left out. The two guesses of each set with the
+    least cost (`seed_costs`) are refined. If both fail a check, the next four are refined.
     """
     seeds = problem.drop_unreachable(seeds)
     attempts = Attempts(torch.ones_like(problem.certificate.closed), is_executable)
@@ -212,10 +223,11 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 
 
 def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Return a checked grasp for each initial guess that was tried, as in the paper, best first.
+    """Return the checked grasps of the paper's solver (COBYLA), one for each initial guess that was
+    tried, best first.
 
     The guesses are tried ten at a time, in the order of their contact sets. This ends when 10
-    grasps are executable or 300 were tried.
+    grasps have passed all checks, or 300 guesses were tried.
     """
     seeds = problem.drop_unreachable(seeds)
     tried = list[Grasps]()

@@ -181,7 +181,7 @@ class GraspErrors(Batch):
     # least clearance [m] of the links from object, table, each other, and obstacles that they must
     # not touch; negative if they overlap
     clearance: Annotated[Float[Tensor, "g"], ANY]
-    # `Status` code of the first of these that is out of tolerance, else `OK`
+    # `Status` code of the first check of tips, joint limits and collisions that fails, else `OK`
     status: Int[Tensor, "g"]
 
 
@@ -196,10 +196,12 @@ def measure_errors(
 ) -> GraspErrors:
     """Return the errors, clearances and status of g grasps; finger i touches contact i.
 
-    With `rolling`, round fingertips may roll on their contacts within the cones of their pads.
-    Without `rolling`, as in the paper, each pad must touch with its own contact point, in any
-    direction. `tolerance` [m] is the largest allowed distance of a tip from its contact. NaN is out
-    of tolerance. Configurations, contacts [m] and `world` are in the object's frame.
+    The `status` is `OK` if tips, joint limits and collisions pass their checks. Links may touch, at
+    a clearance of 0, but not overlap. With `rolling`, round fingertips may roll on their contacts
+    within the cones of their pads. Without `rolling`, as in the paper, each pad must touch with its
+    own contact point, in any direction. `tolerance` [m] is the largest allowed distance of a tip
+    from its contact. NaN is out of tolerance. Configurations, contacts [m] and `world` are in the
+    object's frame.
     """
     spatial = SpatialJacobian.at(hand, configuration)
     touching = hand.tips.contact
@@ -234,10 +236,11 @@ def measure_errors(
 
 
 def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) -> Bool[Tensor, "g"]:
-    """Return a mask of the g configurations in which no link, tips included, touches object, table
-    or another link.
+    """Return a mask (g,) of the configurations in which no link overlaps the object, the table or
+    another link. Links include the fingertips.
 
-    `world` holds the object and the table.
+    `world` holds the object and the table, in the frame of the configurations; its obstacles do not
+    count.
     """
     links, _, table = link_clearance(
         SpatialJacobian.at(hand, configuration), world, tips_touch=False
@@ -255,9 +258,11 @@ def check_candidates(
     """Return a grasp for each candidate, with pre-grasp, approach and the `Status` of the first
     check that it fails.
 
-    With `rolling`, round fingertips may roll on their contacts within the cones of their pads.
-    Without, each pad must touch with its own contact point. `tolerance` [m] is the largest allowed
-    distance of a tip from its contact. `problem` holds the hand and its surroundings.
+    Contacts are checked first, then fingertips, joint limits and collisions. Pre-grasp, approach
+    and the reach of an arm follow. With `rolling`, round fingertips may roll on their contacts
+    within the cones of their pads. Without, each pad must touch with its own contact point.
+    `tolerance` [m] is the largest allowed distance of a tip from its contact. `problem` holds the
+    hand and its surroundings, one row for each candidate.
     """
     hand = problem.hand
     world = problem.world
@@ -337,8 +342,10 @@ def _keep_clear(
 
 
 def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
-    """Return the friction coefficient that each of g contact sets needs if all forces point to the
-    contacts' centroid.
+    """Return the friction coefficient (g,) that each contact set needs if all forces point to its
+    centroid.
+
+    It is the largest ratio of a tangential to a normal force of the set, at most about 1000.
     """
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
     cosine = -dot(inward, contacts.normals)

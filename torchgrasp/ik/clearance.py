@@ -204,11 +204,12 @@ def is_world_fused(world: CollisionWorld | None, *tensors: Tensor) -> TypeGuard[
 
 
 def level(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b"]:
-    """Return the clearances [m] of `points` [m] from a `table`, plus the table's offset.
+    """Return the clearance [m] of each of `points` [m] from a `table`, plus the table's offset.
 
-    The offset is the plane's distance from the origin. So without an edge the results are the
-    coordinates along the table's normal. With an edge, a clearance is the height above the table or
-    the distance beyond the edge, whichever is greater.
+    Points and table are in one frame, and the offset is the plane's distance from its origin. So
+    without an edge the results are coordinates along the table's normal. With an edge, a clearance
+    is the height above the table or the distance beyond the edge, whichever is greater. `*b` stands
+    for any leading axes.
     """
     height = points @ table.normal.to(points)
     if table.edge is None:
@@ -218,10 +219,10 @@ def level(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b"]:
 
 def away(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b 3"]:
     """Return the unit direction in which the clearance of each of `points` [m] from a `table`
-    grows: its gradient.
+    grows: its gradient (*b, 3).
 
-    It is the table's normal. Where a point is farther beyond the table's edge than above the table,
-    it is the edge's outward normal.
+    Points and directions are in the frame of the table. It is the table's normal. Where a point is
+    farther beyond the table's edge than above the table, it is the edge's outward normal.
     """
     normal = table.normal.to(points).expand_as(points)
     if table.edge is None:
@@ -233,9 +234,11 @@ def away(points: Float[Tensor, "*b 3"], table: Plane) -> Float[Tensor, "*b 3"]:
 def table_clearance(
     centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"], table: Plane
 ) -> Float[Tensor, "*b"]:
-    """Return the least clearance [m] of s spheres from a `table`, negative if one is in the table.
+    """Return the least clearance (*b,) [m] of s spheres from a `table`, negative if one is in the
+    table.
 
-    `centres` [m] are in the table's frame, and `radius` [m] holds the spheres' radii.
+    `centres` [m] are in the table's frame, and `radius` [m] holds the spheres' radii. `*b` stands
+    for any leading axes.
     """
     return (level(centres, table) - radius).amin(-1) - table.offset
 
@@ -243,12 +246,12 @@ def table_clearance(
 def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
-    """Return the cost [mm2] of each hand: the sum of squares of the clearances that its spheres
-    lack to 4 mm (`CLEARANCE`).
+    """Return the collision cost (*b,) [mm2] of each hand: the sum of the squared amounts by which
+    clearances are below 4 mm (`CLEARANCE`).
 
-    The clearances are from object, obstacles and table, by the nearest grid nodes. Fingertips may
-    touch the object and the table. `centres` [m] are those of the hand's `spheres`, in the object's
-    frame.
+    The clearances are those of the hand's spheres from object, obstacles and table, by the nearest
+    grid nodes. Fingertips may touch the object and the table. `*b` stands for any leading axes.
+    `centres` [m] are those of the hand's `spheres`, in the object's frame.
     """
     radius = spheres.radius.to(centres)
     cost = centres.new_zeros(centres.shape[:-2])
@@ -267,13 +270,14 @@ def collision_cost(
 def clearance_rows(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[ResidualRows]:
-    """Return residuals (g, k) [mm]: by how much the smallest clearances of g hands are below the
-    wanted ones.
+    """Return two groups of residuals (g, k) [mm]: by how much the smallest clearances of g hands
+    are below the wanted ones.
 
-    The wanted clearance is 1 mm (`SELF_CLEARANCE`) between links, which come first. It is 4 mm
-    (`CLEARANCE`) from object, obstacles and table. A larger clearance gives 0. The 8 (`HINGES`)
-    smallest clearances of each kind enter. `spatial` holds the kinematics of the hands. With
-    `tips_touch` the fingertips may touch the object and the table.
+    The first group is of clearances between links, of which 1 mm (`SELF_CLEARANCE`) is wanted. The
+    second is of those from object, obstacles and table, of which 4 mm (`CLEARANCE`) is wanted. It
+    is missing for an empty world. A larger clearance gives 0. The 8 (`HINGES`) smallest clearances
+    of each kind enter. `spatial` holds the kinematics of the hands. With `tips_touch` the
+    fingertips may touch the object and the table.
     """
     pairs = spatial.hand.self_collision
     moves = spatial.hand.motion.moves
@@ -291,12 +295,12 @@ def clearance_rows(
 def sphere_rows(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[ResidualRows]:
-    """Return residuals (g, k) [mm]: by how much clearances from object, obstacles and table are
-    below 4 mm (`CLEARANCE`).
+    """Return one group of residuals (g, k) [mm]: by how much clearances from object, obstacles and
+    table are below 4 mm (`CLEARANCE`).
 
-    A larger clearance gives 0. The 8 (`HINGES`) smallest clearances of each of g hands from each of
-    the three enter. `spatial` holds the kinematics of the hands. With `tips_touch` the fingertips
-    may touch the object and the table.
+    The list is empty for an empty world. A larger clearance gives 0. The 8 (`HINGES`) smallest
+    clearances of each of g hands from each of the three enter. `spatial` holds the kinematics of
+    the hands. With `tips_touch` the fingertips may touch the object and the table.
     """
     spheres = spatial.hand.collision_spheres
     motion = spatial.hand.motion

@@ -136,13 +136,14 @@ class CobylaRun:
     def clearances(
         self, frames: Float[Tensor, "3 4 l 1"], pose: Float[Tensor, "4 4"]
     ) -> list[Float[Tensor, ""]]:
-        """Return least clearances [m] of the hand from itself and from the world.
+        """Return the list of the least clearances [m] of the hand from itself and from the world.
 
         First is that between the hand's own links. Then follow those from the object to the palm,
         to each finger and to each fingertip. To those of the fingertips 2 mm (`TIP_PENETRATION`)
         are added, since tips may press into the object. Last are those from the table and from
-        obstacles to the hand. Clearances for which the world has no part are left out. `frames` are
-        the link frames in the hand's frame, and `pose` [m] is the hand's in the object's frame.
+        obstacles to the hand. Those from an object, a table or obstacles that do not exist are left
+        out. `frames` are the link frames in the hand's frame, and `pose` [m] is the hand's in the
+        object's frame.
         """
         world = self.world
         spheres = self.hand.collision_spheres

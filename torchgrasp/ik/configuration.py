@@ -93,7 +93,9 @@ class SpatialJacobian(Value):
 
     @classmethod
     def at(cls, hand: Hand, configuration: Configuration) -> "SpatialJacobian":
-        """Return the kinematics of a hand at g configurations, in the object's frame."""
+        """Return the kinematics of a `hand` at g configurations, in the frame of their poses: the
+        object's.
+        """
         root = configuration.obj_from_hand[:, :3].permute(1, 2, 0)
         frames = hand.tree.frames(hand.actuated.couple(configuration.joints).T.contiguous(), root)
         spheres, tips, pads, origins, turning, sliding = hand.motion.place(frames)
@@ -103,8 +105,10 @@ class SpatialJacobian(Value):
     def points(
         self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]
     ) -> Float[Tensor, "g k 3"]:
-        """Return the positions [m] in the object's frame of k points; `local` [m] are their
-        positions in the frames of `links`.
+        """Return the positions (g, k, 3) [m] in the object's frame of k points on the hand's links.
+
+        `links` (k,) are the indices of their links, and `local` [m] their positions in the frames
+        of these links.
         """
         return map_points(self.obj_from_link.index_select(2, links), local).permute(2, 1, 0)
 
@@ -128,11 +132,12 @@ class SpatialJacobian(Value):
 
 
 def differentiate(spatial: SpatialJacobian, parts: Sequence[ResidualRows]) -> Residuals:
-    """Return (residual, Jacobian) of several groups of residuals, one group after the other.
+    """Return the residuals (g, m) of g hands, joined from several groups, then their Jacobian (g,
+    m, 6 + h).
 
-    `parts` are the groups. The m residuals (g, m) of g hands are weighted. They are lengths [mm],
-    or errors of the cosines between pads and surface. The Jacobian is (g, m, 6 + h). It is by the
-    pose's translation [m] and rotation [rad], then by the h actuated joints. `spatial` holds the
+    `parts` are the groups, in the order of the result. The m residuals are weighted. They are
+    lengths [mm], or errors of the cosines between pads and surface. The Jacobian is by the pose's
+    translation [m] and rotation [rad], then by the h actuated joints. `spatial` holds the
     kinematics of the hands.
     """
     residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))

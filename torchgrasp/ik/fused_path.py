@@ -60,7 +60,7 @@ def sweep(
     `direction`. `centres` [m] are those of its s collision spheres at the end of the approach, and
     `radius` [m] their radii. The distance of a sphere from a grid's object is first taken at the
     nearest node. `nodes` is the largest error of this distance, in grid spacings. For spheres that
-    may be the nearest, the distance is then interpolated. If `nodes` is 0, none is.
+    may be the nearest, the distance is then interpolated. If `nodes` is 0, no distance is.
     """
     parts = world_parts(radius, torch.zeros_like(radius, dtype=torch.bool), world)
     least = torch.empty_like(centres[:, 0, 0])

@@ -417,13 +417,13 @@ def solve(
     Args:
         hand: the hand, with h actuated joints.
         configuration: the g configurations at the start.
-        target: wanted fingertip centres [m] in the object's frame.
-        normals: outward unit normals at the contacts.
+        target: wanted fingertip centres (g, f, 3) [m] in the object's frame.
+        normals: outward unit normals (g, f, 3) at the contacts, in the same frame.
         world: what the links must keep clear of.
         tips_touch: whether fingertips may touch the object and the table.
-        weights: weights of the errors of tip positions and of pad directions.
+        weights: weights (no unit) of the errors of tip positions [mm] and of pad directions.
         problem: the parameters of the solver; None means those of `LeastSquares`.
-        steps: most steps; 0 only evaluates.
+        steps: greatest number of steps; with 0 the start is only evaluated.
         fixed: whether the hand's pose stays as it is.
     """
     tables = hand.derived.get(HandTables) or hand.derived.setdefault(HandTables, _tables(hand))

@@ -116,10 +116,11 @@ def rank_pairs(
     candidates: int,
     count: int,
 ) -> Int[Tensor, "r count"]:
-    """Return for each of r contact sets the `count` pairs of least cost, best first.
+    """Return for each of r contact sets the indices (r, count) of its pairs of least cost, best
+    first.
 
-    A pair joins an assignment of contacts to fingers (a in number) and a posture (s in number). Pair
-    i s + j is that of assignment i and posture j, so that p = a s. The cost [mm2] of a pair is
+    A pair joins an assignment of contacts to fingers (a in number) and a posture (s in number).
+    Pair i s + j is that of assignment i and posture j, so that p = a s. The cost [mm2] of a pair is
     `weight` times its energy, plus the `collision_cost` of the hand that is so placed.
 
     Args:

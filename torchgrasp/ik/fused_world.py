@@ -81,7 +81,7 @@ def world_parts(
 
     What does not exist in the world has the `kind` 0. The field `grown` turns distances of the
     spheres' centres into clearances: it is minus their radius. Spheres of fingertips may touch the
-    object, so it is infinite there. At the table, their clearance is raised by a constant.
+    object, so it is infinite there. At the table, their clearance is raised by 4 mm (`CLEARANCE`).
 
     Args:
         radius: radii (s,) [m] of the s collision spheres of the hand.

@@ -124,7 +124,10 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """The least-squares problem of hand posture and contacts together, for a batch of grasps."""
+    """The least-squares problem of hand posture and contacts together, for a batch of grasps.
+
+    Its unknowns are a `JointState`: hand pose, joints, contact points and tensions.
+    """
 
     hand: Hand  # the hand
     shape: ShapeLike  # the estimated shape, or a batch of one for each grasp
@@ -132,7 +135,9 @@ class JointProblem:
     world: CollisionWorld  # what the hand must not touch
 
     def rows(self, index: Int[Tensor, "k"]) -> "JointProblem":
-        """Return the problems of the k grasps with the indices `index` in the batch."""
+        """Return the problem of some grasps of the batch: those with the indices `index` (k,), in
+        this order.
+        """
         shape = rows_of(self.shape, index)
         contact_problem = self.contact_problem.rows(index)
         return JointProblem(self.hand, shape, contact_problem, self.world.rows(index))
@@ -141,11 +146,10 @@ class JointProblem:
         """Return all weighted residuals (g, k) of a `state`, then their Jacobian (g, k, d).
 
         First are the residuals of the hand (`grasp_residuals`). They are lengths [mm] and weighted
-        errors of the cosines between pads and surface.
-        Then follow those of the contacts, times 2 (`CONTACT_WEIGHT`) and the shape's scale [mm]. In
-        the shape k counts residuals, and d unknowns. The Jacobian is by hand pose (6), joints,
-        contacts and tensions. `flat` is the constraint that contacts are on flat surface; None
-        leaves it out.
+        errors of the cosines between pads and surface. Then follow the constraints on the contacts,
+        times 2 (`CONTACT_WEIGHT`) and the shape's scale [mm]. k counts residuals, and d unknowns.
+        The Jacobian is by hand pose (6), joints, contacts and tensions. `flat` is the constraint
+        that contacts are on flat surface; None leaves it out.
         """
         hand = self.hand
         shape = self.shape
@@ -224,8 +228,8 @@ class JointProblem:
         given up. Return also their indices (k,) among the g grasps at the start.
 
         `configuration` holds the g hands at the start, and `points` their normalised contacts. The
-        least-squares problem is solved in three stages (`STAGES`). After them, grasps whose cost is
-        not below 1e5, 1e4 and 500 mm2 are given up (`SlidingStage.hopeless`).
+        least-squares problem is solved in four stages (`STAGES`). After them, grasps whose cost is
+        not below 1e5, 1e4, 500 and 50 mm2 are given up (`SlidingStage.hopeless`).
         """
         own = self
         largest = self.contact_problem.spec.flatness
@@ -262,8 +266,8 @@ def solve_sliding(
 ) -> None:
     """Optimise hand and contacts together for each unsolved contact set of `attempts`.
 
-    The checked grasps are added to `attempts`. Grasps whose cost stays high are left out
-    (`JointProblem.solve`).
+    The checked grasps are added to `attempts`. A grasp is left out if its final cost is 50 mm2 or
+    more. It is left out earlier if the cost exceeds larger bounds (`JointProblem.solve`).
 
     Args:
         joint_problem: the least-squares problem of hand and contacts, for each contact set.

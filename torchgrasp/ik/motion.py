@@ -241,8 +241,8 @@ def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> floa
     """Return the least clearance [m] of the lifted object from obstacles; far below 0 if an
     obstacle is on it.
 
-    `vertices` [m] are those of the object, in the frame of the obstacles. It is lifted along z by
-    0.1 m (`MOTION.lift`). Without vertices the clearance is infinite.
+    `vertices` [m] are those of the object, in the frame of the obstacles. The object is lifted
+    along z by 0.1 m (`MOTION.lift`). Without vertices the clearance is infinite.
     """
     if not len(vertices):
         return math.inf

@@ -105,8 +105,10 @@ class PressPostures(Batch):
 def press_postures(hand: Hand, seed: Seed = 0) -> PressPostures:
     """Return the pressing postures of a hand, found among random postures drawn from `seed`.
 
-    At most 200 (`PRESS.kept`) are returned, and none if no posture presses. They are in float64 on
-    the CPU. The result is cached in `hand.derived`.
+    In such a posture the tips of one or two fingers are lowest: all else is higher by 6 mm
+    (`PRESS.gap`). Each pressing finger can press with 5 to 60 N, and faces down within 60 degrees.
+    At most 200 (`PRESS.kept`) postures are returned, in float64 on the CPU; there may be none. The
+    result is cached in `hand.derived`.
 
     Raises `BadArgument` if almost all random postures of the hand collide with themselves.
 

@@ -103,12 +103,12 @@ def grasp_residuals(
 ) -> Residuals:
     """Return the weighted residuals (g, k) of each hand, then their Jacobian (g, k, 6 + h).
 
-    They are errors of tip positions [mm] and of cosines of pad directions (no unit; `tip_rows`).
-    With a `world`, they go on with how far clearances [mm] are below the wanted ones
-    (`clearance_rows`). The Jacobian is with respect to the hand's pose (6) and its h joints.
-    `target` [m] holds the wanted tip centres, and `normals` the outward unit normals at the
-    contacts, in the object's frame. With `tips_touch` the fingertips may touch the object and the
-    table.
+    First are errors of tip positions [mm], then of cosines of pad directions (no unit; `tip_rows`).
+    With a `world`, residuals of clearances follow: by how much [mm] each is below the wanted one
+    (`clearance_rows`). None leaves them out. The Jacobian is with respect to the hand's pose (6)
+    and its h joints. `target` [m] holds the wanted tip centres, and `normals` the outward unit
+    normals at the contacts, in the object's frame. With `tips_touch` the fingertips may touch the
+    object and the table.
     """
     posture = configuration.joints, configuration.obj_from_hand
     if is_world_fused(world, *posture, target, normals):
@@ -132,9 +132,9 @@ def refine(
     """Return hand configurations moved so that finger i touches contact i and, with a `world`,
     links are clear.
 
-    The solver may not succeed, so check the result. A configuration is done when the sum of its
-    squared `grasp_residuals` [mm2] is below `solved`, or after `steps` steps. A `world` of None
-    leaves out all clearances, also those between links.
+    Contacts, poses and `world` are in one frame. The solver may not succeed, so check the result. A
+    configuration is done when the sum of its squared `grasp_residuals` [mm2] is below `solved`, or
+    after `steps` steps. A `world` of None leaves out all clearances, also those between links.
     """
     target = tip_targets(hand, contacts)
     normals = contacts.normals

@@ -405,11 +405,13 @@ def query_mixture(
     """Return initial guesses (seeds) for sets of three contacts from the learned model `mixture`.
 
     They follow Eqs. (21)-(24) of the paper. An assignment of contacts to fingers is reachable if
-    its energy (Eq. 21, no unit) is below `max_energy`. Each reachable assignment gives `n_seeds`
-    seeds: the mean joints given the contacts (Eq. 23), and the mean joints of the most responsible
-    components. The seeds of a contact set are sorted. Seeds that touch the surface from outside
-    come first, then the tip error counts. A contact set without a reachable assignment has no
-    seeds. Raises `BadArgument` for a model of another hand, joint limits or fingertips.
+    its energy is below `max_energy`. The energy (Eq. 21, no unit) is half the squared Mahalanobis
+    distance of the contacts from the nearest Gaussian of the model. Each reachable assignment gives
+    `n_seeds` seeds: the mean joints given the contacts (Eq. 23), and the mean joints of the
+    Gaussians of the model that explain the contacts best. The seeds of a contact set are sorted.
+    Seeds that touch the surface from outside come first, then the tip error counts. A contact set
+    without a reachable assignment has no seeds. Raises `BadArgument` for a model of another hand,
+    joint limits or fingertips.
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)

@@ -203,11 +203,11 @@ def _refine_seeds(
 def refine_exactly(
     hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Return hand configurations moved from `start` onto their contacts, clear of the `world`.
+    """Return hand configurations moved from `start` onto their `contacts`, clear of the `world`.
 
-    Finger i touches contact i. Each is refined with a margin of clearance, then from there without
-    regard to clearance. The second result counts where it passes all checks (`measure_errors`),
-    else the first.
+    Finger i touches contact i; poses, contacts and `world` are in one frame. Each configuration is
+    refined twice: first with a margin of clearance, then from there without regard to clearance.
+    The second result is returned where it passes all checks (`measure_errors`), else the first.
     """
     refined = refine(hand, start, contacts, world, SOLVING.solved)
     settled = refine(hand, refined, contacts, None, SOLVING.solved)

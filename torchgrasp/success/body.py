@@ -32,7 +32,9 @@ class EstimatedBody(NamedTuple):
 
     @classmethod
     def of(cls, shape: ShapeGP) -> "EstimatedBody":
-        """Return the estimate of one object from its `shape`, which is in an upright frame."""
+        """Return the estimate of one object from its `shape`, which is in an upright frame: z
+        points up. Surface mesh and distance field are computed from the shape.
+        """
         mesh = extract_mesh(shape)
         return cls.around(shape, mesh.vertices, collision_field(shape, mesh))
 
@@ -40,9 +42,10 @@ class EstimatedBody(NamedTuple):
     def around(
         cls, shape: ShapeGP, vertices: Float[Tensor, "v 3"], field: DistanceField
     ) -> "EstimatedBody":
-        """Return the estimate of one object from its `shape`. `vertices` (v, 3) [m] are those of
-        its surface mesh, and `field` gives the distances from this surface. All are in an upright
-        frame.
+        """Return the estimate of one object from its `shape` and its known surface.
+
+        `vertices` (v, 3) [m] are those of the surface's mesh, and `field` gives the signed
+        distances [m] from it. All are in an upright frame: z points up.
         """
         center = vertices.mean(0)
         rise = vertices[:, 2].amax() - vertices[:, 2].amin()
@@ -50,9 +53,9 @@ class EstimatedBody(NamedTuple):
         return cls(shape, field, center, shape.scale, float(rise), float(deviations[1]))
 
     def rows(self, index: Int[Tensor, "k"]) -> "EstimatedBody":
-        """Return the estimates for the entries of the batch with the k indices `index`.
+        """Return the estimates for some entries of the batch: those with the indices `index` (k,).
 
-        If the body is one object for all entries, it is returned as it is.
+        If the estimate is of one object for all entries, the same estimate is returned.
         """
         numbers = (
             x[index] if isinstance(x, Tensor) and x.ndim else x

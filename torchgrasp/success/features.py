@@ -92,16 +92,16 @@ def measure_grasps(
     task: GraspTask,
     lifted: bool,
 ) -> Float[Tensor, "c g k"]:
-    """Return the k features of each of g grasps for a task, for each of c conditions.
+    """Return the k features that predict the success of g grasps in a task, for each of c
+    conditions.
 
-    The features are in the order of the tuple `FEATURES`.
-
-    The dict `CAUSES` gives their units; shares and logarithms have none. Body and grasps are in an
-    upright frame; `body` is one object for all grasps, or one for each. `conditions` are c pairs of
-    a friction coefficient and a mass [kg]; they replace the mass of the `task`. `lifted` says
-    whether the task is a lift; otherwise the object is pulled. A force to spare is the logarithm of
-    a ratio: the fingers' strength divided by the force needed. "force needed", "force to spare" and
-    the features named "slippery" are at half the friction.
+    The features are in the order of the tuple `FEATURES`. The dict `CAUSES` gives their units;
+    shares and logarithms have none. Body and grasps are in an upright frame; `body` is one object
+    for all grasps, or one for each. `conditions` are c pairs of a friction coefficient and a mass
+    [kg]; they replace the mass of the `task`. `lifted` says whether the task is a lift; otherwise
+    the object is pulled. A force to spare is the logarithm of a ratio: the fingers' strength
+    divided by the force needed. "force needed", "force to spare" and the features named "slippery"
+    are at half the friction.
     """
     contacts = grasps.contacts
     g = len(grasps)
@@ -178,7 +178,7 @@ def carries_weight(
     """Return a mask of the g grasps whose fingers can carry the weight of a mass.
 
     They can if contact forces exist that balance the weight, within the friction cones. No force
-    may exceed `most`, or what the torques of the drives allow. It is found by linear programming.
+    may exceed `most`, or what the torques of the drives allow. Linear programming decides this.
 
     Args:
         hand: the hand of the grasps.

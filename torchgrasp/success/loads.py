@@ -77,7 +77,8 @@ def carrying_force(
     load: Float[Tensor, "3"],
     push: float = 0.0,
 ) -> Float[Tensor, "m b"]:
-    """Return the least factor s on balanced forces at which all contacts stick.
+    """Return the least factor s on balanced contact forces at which all contacts stick under a
+    load.
 
     The result holds a factor (no unit) for each of m `frictions`, the friction coefficients, and b
     contact sets. `forces` f_0 [N] balance each other without a load. The `load` [N] acts at
@@ -111,8 +112,8 @@ def carrying_force(
 def greatest_force(
     hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> Float[Tensor, "g"]:
-    """Return the largest factor (no unit) on the `forces` [N] of each of g grasps at which no drive
-    exceeds its greatest torque.
+    """Return the factor (g,) (no unit) on the `forces` [N] of each grasp at which a drive reaches
+    its greatest torque.
 
     The forces (g, f, 3) act at the f contacts of each grasp, in the frame of the grasps. Forces
     that are NaN give NaN.
@@ -142,7 +143,8 @@ def squeezing_strength(
     forces: Float[Tensor, "g f 3"],
     most: float,
 ) -> Float[Tensor, "g"]:
-    """Return how hard [N] each posture of the hand can squeeze its object, at most `most` [N].
+    """Return the force (g,) [N] with which each posture of the hand can squeeze its object, at most
+    `most` [N].
 
     It is the normal force of the strongest finger at which a drive reaches its greatest torque.
     `held` gives the postures of the hand in g grasps. `contacts` are their contacts, one for each

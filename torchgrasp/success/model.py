@@ -63,10 +63,11 @@ class SuccessModel(Value):
     def mean_log_odds(
         self, features: Float[Tensor, "c g k"], weights: Float[Tensor, "c"]
     ) -> Float[Tensor, "g"]:
-        """Return the log-odds of the mean probability of success of g grasps under c conditions.
+        """Return the log-odds (g,) of each grasp's mean probability of success over c conditions.
 
         A condition is a pair of a friction and a mass. `features` are those of each grasp under
-        each condition, and `weights` the probabilities of the conditions.
+        each condition, in the order of `FEATURES`. `weights` (c,) are the probabilities of the
+        conditions, of sum 1.
         """
         log_odds = self.log_odds(features.flatten(0, 1)).view(features.shape[:2])
         if len(log_odds) == 1:
@@ -88,10 +89,11 @@ class SuccessModel(Value):
             depth = depth + 1
 
     def interval(self, log_odds: Float[Tensor, "*g"]) -> Float[Tensor, "*g 2"]:
-        """Return the least and the greatest share, in [0, 1], of grasps with these log-odds that
-        held in trials. The result has one pair for each of the `log_odds`, of any shape.
+        """Return the least and the greatest share (*g, 2) of grasps with given `log_odds` that held
+        in trials, in [0, 1].
 
-        Both are interpolated linearly between `bands`.
+        The result has one pair for each of the `log_odds`, a tensor of any shape `*g`. Both are
+        interpolated linearly between `bands`.
         """
         at = self.bands[:, 0].contiguous()
         low_high = self.bands[:, 1:]
@@ -102,5 +104,8 @@ class SuccessModel(Value):
 
 @functools.cache
 def load_success_model(device: torch.device | str = "cpu") -> SuccessModel:
-    """Return the model of success that torchgrasp ships, in float64 on a `device`."""
+    """Return the model of success that torchgrasp ships, in float64 on a `device`.
+
+    It is read once for each device, and then shared.
+    """
     return read_value(MODEL, KIND, SuccessModel)[0].to(device)

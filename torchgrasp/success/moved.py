@@ -62,8 +62,8 @@ class MovedContacts(NamedTuple):
             grasp.
         forces: balanced contact forces [N] of these sets, of which the largest normal force is 1 N;
             NaN if there are none. They are in the order and frame of `contacts`.
-        touched: whether all f fingers of a grasp touch the displaced object, and can press on it
-            with balanced forces.
+        touched: mask (d, g) of grasps on the displaced object. It is true where all f fingers
+            touch, and can press with balanced forces.
     """
 
     contacts: Contacts
@@ -74,7 +74,8 @@ class MovedContacts(NamedTuple):
 def touch_moved(
     hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> MovedContacts:
-    """Return the contacts of g grasps after each of 16 displacements of the object (`MOVED.count`).
+    """Return the contacts of g grasps after each of 16 displacements of the object (`MOVED.count`),
+    with their forces.
 
     The displacements are at most 20 mm long (`MOVED.radius`). They fill a ball evenly, in the axes
     of the hand. The contacts are in the frame of the object, as `field`. Each fingertip moves along
@@ -105,8 +106,8 @@ def touch_moved(
 def trace(
     field: DistanceField, start: Sets, way: Sets, radius: Float[Tensor, "f"]
 ) -> tuple[Sets, Sets, Bool[Tensor, "d g f"]]:
-    """Return for each moving ball the surface point [m] that it first touches, the normal there,
-    and whether it touches.
+    """Return for each ball that moves on a straight line the surface point [m] that it first
+    touches. Return then the normal there, and whether the ball touches.
 
     The balls belong to d displacements, g grasps and f fingertips. All tensors but `radius` have
     the shape (d, g, f, 3), and the mask (d, g, f). Ball f, of a `radius` [m], starts with its

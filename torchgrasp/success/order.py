@@ -32,7 +32,8 @@ def is_covered(features: Float[Tensor, "g k"], names: Sequence[str] = DOMAIN) ->
     """Return a mask of the g grasps for which trials support the prediction of success.
 
     `features` (g, k) are those of the success model, in the order of the tuple `FEATURES`. Trials
-    support a prediction if the features called `names` lie within the range of the trials.
+    support a prediction if the features called `names` lie within their range in the trials of the
+    success model.
     """
     rows = [FEATURES.index(name) for name in names]
     least, most = load_success_model(features.device).range[rows].T
@@ -53,8 +54,10 @@ def covered_share(features: Float[Tensor, "c g k"], conditions: Conditions) -> F
 
 
 def supported_share(conditions: Conditions) -> float:
-    """Return the probability that friction and mass, distributed as in `conditions`, lie within the
-    range of the model's trials.
+    """Return the probability that friction and mass both lie within their range in the trials of
+    the success model.
+
+    They are independent, and distributed as in `conditions`.
     """
     share = 1.0
     for name, law in (("friction", conditions.friction), ("mass", conditions.mass)):
@@ -99,10 +102,10 @@ def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], covered: Float[Tensor, "
 
 
 def keep_promise(grasps: Grasps, share: float) -> Grasps:
-    """Return the grasps, in which executable ones with too low a predicted success get the status
-    `NO_PROMISE`.
+    """Return the grasps with the status `NO_PROMISE` for executable ones whose predicted success is
+    too low for a promise.
 
-    `share`, in [0, 1], is the promised share of the remaining executable grasps that hold.
+    The promise is that at least a `share`, in [0, 1], of the grasps that stay executable hold.
     `find_promise` gives the bound of the log-odds for this share. An executable grasp keeps its
     status if its success is known and its log-odds are at least this bound. Without a bound, none
     keeps it.

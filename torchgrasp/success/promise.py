@@ -26,8 +26,8 @@ BOUNDS = 200  # bounds of the log-odds that are tried, at equal steps
 
 
 class Promise(NamedTuple):
-    """A bound of the predicted success: of the grasps above it, a promised share holds, as trials
-    support.
+    """A bound of the predicted success, above which a promised share of the grasps holds, by the
+    evidence of trials.
     """
 
     least: float  # least predicted log-odds of success of a returned grasp
@@ -37,8 +37,11 @@ class Promise(NamedTuple):
 
 @functools.cache
 def find_promise(share: float) -> Promise | None:
-    """Return the promise that at least a `share` of the returned grasps, in [0, 1], holds. Return
-    None if the trials support no bound.
+    """Return the least bound of the predicted success above which at least a `share` of the grasps
+    holds.
+
+    `share` is in [0, 1]. The trials of the shipped success model support it. None means that they
+    support no bound.
     """
     log_odds, held, family = load_success_model().kept.unbind(1)
     least = least_log_odds(log_odds, held > 0, family.long(), share)
@@ -46,7 +49,10 @@ def find_promise(share: float) -> Promise | None:
 
 
 def describe_promise(share: float) -> str:
-    """Return a text that names the promised `share`, in [0, 1], and the trials that support it."""
+    """Return a text that names the promised `share`, in [0, 1], and the trials that support it.
+
+    If no trials support it, the text says so.
+    """
     promise = find_promise(share)
     if promise is None:
         return f"{share:g}, which no trials support"
@@ -61,10 +67,10 @@ def least_log_odds(
 ) -> float | None:
     """Return the least bound of the log-odds above which at least a `share` of the grasps holds.
 
-    None means that the trials support no bound. `share` is in [0, 1]. The bound is chosen by
-    conformal risk control over families of bodies. It is the least b with sum_f l_f + `share` <= 0.
-    Here l_f is the mean of 1[log-odds >= b] (1[failed] - (1 - `share`)) over the trials of family
-    f.
+    These are log-odds of success. None means that the trials support no bound. `share` is in [0,
+    1]. The bound is chosen by conformal risk control over families of bodies. It is the least b
+    with sum_f l_f + `share` <= 0. Here l_f is the mean of 1[log-odds >= b] (1[failed] - (1 -
+    `share`)) over the trials of family f.
 
     The r trials have the predicted `log_odds`. `held` says whether each grasp held, and `family`
     holds the number of its family of bodies.

@@ -142,8 +142,11 @@ def explain_success(
 
 
 def conditions_of(grasps: Grasps, task: GraspTask) -> Conditions:
-    """Return the frictions and masses for which the success in a task is predicted. The masses are
-    those of the `task`; the friction is that in the metadata of the grasps.
+    """Return the pairs of friction and mass for which the success of `grasps` in a `task` is
+    predicted.
+
+    The masses are those of the `task`. The friction is in the metadata of the grasps, as the text
+    of a `Distribution`.
     """
     return Conditions.of(Distribution.parse(grasps.meta["friction"]), task.mass)
 
@@ -175,10 +178,12 @@ def _is_carried(hand: Hand, body: EstimatedBody, grasp: Grasps, task: GraspTask)
 
 
 def stand_upright(grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[Hand, EstimatedBody, Grasps]:
-    """Return the hand on the device of the grasps. Then return object and grasps in an upright
+    """Return the hand, the estimated object and the grasps, the last two turned to an upright
     frame, with z up.
 
-    The `shape` is in the frame of the grasps.
+    The `shape` of the object is in the frame of the grasps. Up is the normal of the grasps' table,
+    or without a table the direction to the camera. The hand is moved to the device and dtype of the
+    grasps.
     """
     frame = inverse(upright_frame(shape.cloud.points, shape.cloud.viewpoint, grasps.table))
     hand = hand.to(grasps.joints.device, grasps.joints.dtype)

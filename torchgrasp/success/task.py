@@ -147,18 +147,22 @@ class Conditions:
 
     @functools.cached_property
     def frictions(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """The n coefficients of friction, and their probabilities."""
+        """The n coefficients of friction that stand for its distribution, then their n
+        probabilities.
+        """
         return self.friction.nodes(CONDITIONS.one)
 
     @functools.cached_property
     def masses(self) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
-        """The m masses [kg], and their probabilities."""
+        """The m masses [kg] that stand for their distribution, then their m probabilities."""
         certain = len(self.frictions[0]) == 1
         return self.mass.nodes(CONDITIONS.one if certain else CONDITIONS.both)
 
     @property
     def weights(self) -> Float[Tensor, "c"]:
-        """The probability (c,) of each pair of a friction and a mass. The mass changes fastest."""
+        """The probability (c,) of each pair of a friction and a mass. From pair to pair the mass
+        changes first.
+        """
         return torch.outer(self.frictions[1], self.masses[1]).flatten()
 
 
@@ -233,7 +237,9 @@ def loads_of(
     frame's origin.
 
     Args:
-        resist: the loads: "lift", "pour" or "push", several of these names, or `TaskWrenches`.
+        resist: the loads: names, or `TaskWrenches`. "lift" is the weight. "pour" is the weight
+            while the object is tilted by up to 120 degrees. "push" is the weight, and 2.5 N in any
+            direction. A tuple of these names joins their loads.
         mass: mass of the object [kg], of a distribution the greatest one.
         center: estimated centre of the object [m] in the upright frame.
         upright_from_obj: transform from the cloud's frame, in which `TaskWrenches` are, to the

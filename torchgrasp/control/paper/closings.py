@@ -58,9 +58,9 @@ class UnstableNumbers:
     wait: float = 0.3
     """Delay [s] from the end of the forces' rise until the low-passed readings are judged."""
     raised: float = 2.0
-    """Factor to which the forces are raised."""
+    """Factor by which the forces of an unstable grasp grow in the end."""
     rate: float = 8.0
-    """Rate [1/s] at which forces and stiffness change."""
+    """Rate [1/s] at which forces and stiffness approach their new values."""
 
 
 POSITION = PositionNumbers()
@@ -121,7 +121,8 @@ class PositionClosing:
     finger at a force of 0.5 N (`STOP_FORCE`).
 
     The goal is `depth` [m] behind the planned contact, inside the object. With the paper's depth of
-    0 a finger may stop before it touches.
+    0 a finger may stop before it touches. A finger also stops within 1 mm of its goal, and `done`
+    is true when all have stopped.
     """
 
     palm = STILL  # displacement (3,) [m] of the palm from its planned pose: none
@@ -152,7 +153,7 @@ class PositionClosing:
 
 class OpenLoopClosing:
     """Closing controller without sensors: the joints move from the pre-grasp to the grasp, then to
-    targets that press.
+    the squeeze. The squeeze is joint targets beyond the grasp, with which the fingers press.
     """
 
     palm = STILL  # displacement (3,) [m] of the palm from its planned pose: none
@@ -186,8 +187,8 @@ class OpenLoopClosing:
 def restoring_wrench(
     hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, "*b 4 4"]
 ) -> Float[Tensor, "*b 6"]:
-    """Return the force [N] and torque [N m] of a spring that pulls the fingertips' frame back to
-    its `rest` pose.
+    """Return the wrench (*b, 6) of a spring that pulls the frame of three fingertips back to its
+    `rest` pose: force [N], then torque [N m].
 
     `hand_from_vf` [m] is the pose of the virtual frame of three fingertips. This frame has its
     origin at their centroid (Eq. 18 of the paper). Poses, force and torque are in the hand's frame.
@@ -234,8 +235,9 @@ def spring_forces(
 
 
 def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the lengths [m] of the sides (0, 1), (1, 2) and (2, 0) of the triangle of three
-    `points` [m].
+    """Return the lengths (*b, 3) [m] of the sides of the triangle of three `points` [m].
+
+    The sides are (0, 1), (1, 2) and (2, 0). `*b` stands for any leading axes.
     """
     return norm(points.roll(-1, dims=-2) - points)
 
@@ -315,9 +317,11 @@ class Impedance:
 
     @checked
     def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-        """Return the forces [N] of the fingertips on the object, given their centres `tips` [m].
+        """Return the desired forces (3, 3) [N] of the fingertips on the object, given their centres
+        `tips` [m].
 
-        Both are in the hand's frame.
+        They are the balanced forces, turned with the triangle of fingertips, plus those of the
+        virtual springs. Forces and `tips` are in the hand's frame.
         """
         frame = self._frame(tips)
         desired = self.raised * self.factor * self.desired @ frame[:3, :3].T

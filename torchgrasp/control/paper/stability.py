@@ -93,8 +93,9 @@ class StabilityModel(Value):
         self, tips: Float[Tensor, "3 3"], force: Positive | None = None
     ) -> PreferredForces:
         """Return the typical forces [N] and stiffnesses [N/m] of stable grasps with fingertip
-        centres `tips` [m]. Only the distances of the tips from their centroid count.
+        centres `tips` [m].
 
+        Only the distances of the tips from their centroid count, so `tips` may be in any frame.
         `force` [N] is the normal force of the finger that presses hardest; None means that the
         model chooses it.
         """
@@ -119,8 +120,10 @@ class StabilityModel(Value):
 
     @checked(gradients=True)
     def log_odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
-        """Return the natural log-odds that a grasp with the `state` is stable, by Bayes' rule on
-        stiffness and forces. `state` holds nine logarithms (`state_of`).
+        """Return the natural log-odds (*b) that grasps with a `state` are stable, by Bayes' rule.
+
+        `state` (*b, 9) holds the logarithms of three stiffnesses, distances and forces
+        (`state_of`). The three distances do not count. `*b` stands for any leading axes.
         """
         stable, others = self._without_lengths
         judged = torch.cat([state[..., :3], state[..., 6:]], -1)  # (*b, 6)
