@@ -95,11 +95,10 @@ def _sizes(
 
 
 def tick_of(lift: ClosureResult, phase: int) -> int:
-    """Return the index of the control tick, a period of the controller, at which a phase of the
-    recorded `lift` ended.
+    """Return the index of the control tick in the record `lift` at which a phase of the lift ended.
 
-    The `phase` is 0 (approach), 1 (closing) or 2 (pressing). A phase that did not end, with NaN in
-    `ClosureResult.phases`, gives the last tick.
+    A tick is a period of the controller. The `phase` is 0 (approach), 1 (closing) or 2 (pressing).
+    A phase that did not end, with NaN in `ClosureResult.phases`, gives the last tick.
     """
     end = lift.phases[phase]
     return int((lift.time - end).abs().argmin()) if bool(end.isfinite()) else len(lift.time) - 1
@@ -108,12 +107,12 @@ def tick_of(lift: ClosureResult, phase: int) -> int:
 def moved_in_hand(
     lift: ClosureResult, centre: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
-    """Return (distance, angle): how far the object has moved [m] and turned [rad] relative to the
-    hand's root link since the pressing ended.
+    """Return how far the object has moved [m] and turned [rad] in the hand since the pressing
+    ended.
 
-    Both are (t,), for the t control ticks of the record `lift`. Earlier ticks are compared with the
-    end of the pressing, too. `centre` (3,) [m] is the point of the true mesh whose motion counts,
-    in the frame of the grasp, that of the planned cloud.
+    Both are (t,), for the t control ticks of the record `lift`, and relative to the hand's root
+    link. Earlier ticks are compared with the end of the pressing, too. `centre` (3,) [m] is the
+    point of the true mesh whose motion counts. It is in the frame of the planned cloud.
     """
     hand_from_object = inverse(lift.hand_pose.double()) @ lift.object_pose.double()
     start = hand_from_object[tick_of(lift, 2)]

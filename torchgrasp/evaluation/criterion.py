@@ -71,8 +71,8 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
 
 
 def motion_between(first: Tick, last: Tick, in_hand: bool = True) -> ObjectMotion:
-    """Return how far the object's centre moved [m] and the object turned [rad] from the control
-    tick `first` to the tick `last`.
+    """Return how far the object's centre moved [m] and the object turned [rad] between two control
+    ticks, `first` and `last`.
 
     Both are relative to the hand's root link, or to the world if `in_hand` is False.
     """

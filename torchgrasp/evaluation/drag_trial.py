@@ -170,9 +170,9 @@ class EdgeLift(NamedTuple):
     def held(self) -> bool:
         """Whether the last try held the object; False without a try.
 
-        The object is held if its centre rose by at least half of the lift, and at least two fingers
-        touch it at the end. In the closed hand it must have slipped by less than 20 mm and 30
-        degrees.
+        The object is held if three conditions are met. Its centre rose by at least half of the
+        lift. At least two fingers touch it at the end. It slipped by less than 20 mm and 30 degrees
+        in the closed hand.
         """
         return bool(self.tries) and self.tries[-1].result.held
 

@@ -148,9 +148,9 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
     """Run one simulated trial: close the hand, lift the object and hold it; return the record.
 
     `trial` has the hand, a single grasp and the true object. `spec` are the parameters of the
-    trial; None means `TrialSpec()`. The object is held if its centre rose by at least half of the
-    lift, and at least two fingers touch it at the end. In the closed hand it must have slipped by
-    less than 20 mm and 30 degrees.
+    trial; None means `TrialSpec()`. The object is held if three conditions are met. Its centre rose
+    by at least half of the lift. At least two fingers touch it at the end. It slipped by less than
+    20 mm and 30 degrees in the closed hand.
 
     Raises `BadArgument` for a trial whose hand, grasp, mesh and table do not fit together. Raises
     `MeshError` for a mesh that is missing, open or without volume, and `MissingExtra` without the

@@ -132,8 +132,9 @@ class Protocol(Value):
 
     @property
     def task(self) -> GraspTask:
-        """What a grasp must do in the protocol's trials, a lift or pulls: the argument `task` of
-        `plan_grasps`, which predicts the success for it.
+        """What a grasp must do in the protocol's trials: a lift, or pulls.
+
+        It is the argument `task` of `plan_grasps`, which predicts the success in this task.
 
         >>> find_protocol("dexgraspbench").task.describe()
         'pulls of 0.1 kg with 7 N'
@@ -260,9 +261,10 @@ def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]
 @checked
 def seed_of(seed: Seed, *names: str | int) -> int:
     """Return the random seed for one purpose: a hash of an evaluation's `seed` and the purpose's
-    `names`, such as those of object and view.
+    `names`.
 
-    Draws with different names are independent of each other, and of the order of the draws.
+    The names are, for example, those of object and view, and the grasp's rank. Draws with different
+    names are independent of each other, and of the order of the draws.
     """
     digest = hashlib.sha256(json.dumps([seed, *names]).encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
@@ -299,8 +301,8 @@ def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor
 def draw_object_poses(
     noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed
 ) -> Float[Tensor, "n 4 4"]:
-    """Return n = `count` random displacements of an object on its table, as rigid transforms
-    (n, 4, 4) [m].
+    """Return n = `count` random displacements of an object on its table, as rigid transforms (n, 4,
+    4) [m].
 
     The frame is one whose z axis is the table's normal. Each displacement shifts the object along x
     and y, and turns it about the vertical through the point `pivot` (3,) [m]. `noise` bounds the

@@ -97,12 +97,11 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
-    """Run the pull trial that `driver` has checked: grasp the object once, then pull at it in six
-    directions until one pull fails. Return the result.
+    """Run the pull trial that `driver` has checked, and return its result.
 
-    Every pull starts from the same closed grasp, along -x, +x, -y, +y, -z and +z of the simulator's
-    frame. `spec` gives the force and time of each pull, and the motion of the object at which it
-    fails.
+    The hand grasps the object once. Pulls in six directions follow, until one fails. Every pull
+    starts from the same closed grasp, along -x, +x, -y, +y, -z and +z of the simulator's frame.
+    `spec` gives the force and time of each pull, and the motion of the object at which it fails.
     """
     started = time.process_time()
     run = driver.open()

@@ -57,7 +57,7 @@ class TrialNumbers:
     speed: float = 0.2
     """Mean speed [m/s] of an approach in which touches do not stop the hand."""
     slack: float = 0.03
-    """Distance [m] of a contact from the mesh beyond which it is off the mesh: objects may be a bit
+    """Distance [m] from the mesh beyond which a contact is off the mesh: objects may be a bit
     misplaced.
     """
     relooked: float = 1.5
@@ -391,8 +391,9 @@ class TrialRun:
     def approach(self) -> Iterator[None]:
         """Move the opened hand straight to its pre-grasp; yield after every control tick.
 
-        If `ClosingOptions.stops` is above 0, a touch stops the hand. The object is displaced
-        halfway if the trial says so (`Truth.slide`).
+        A touch stops the hand if `ClosingOptions.stops` is above 0. The hand must then have tactile
+        sensors, and know a table and a surface. The object is displaced halfway by `Truth.slide`,
+        if that is not None.
         """
         half = 0.5 * self.spec.approach
         if self.controller.approaching:
@@ -464,8 +465,8 @@ class TrialRun:
         return math.nan, math.nan
 
     def strained(self) -> bool:
-        """Return whether a joint's drive is at its limit: the torque that it needs to reach its
-        target is at least its greatest torque.
+        """Return whether a joint's drive is at its limit: it needs its greatest torque, or more, to
+        reach its target.
 
         In the holding mode "grip" the torque that the drive needs for the gripping force counts.
         """

@@ -91,7 +91,8 @@ def edge_in_world(
 
 
 def joints_by_name(hand: Hand, joints: Float[Tensor, " h"]) -> dict[str, float]:
-    """Return the positions [rad or m] of all movable joints of the URDF by name, given those of the
-    h actuated joints, `joints` (h,).
+    """Return the positions [rad or m] of all movable joints of the URDF by name.
+
+    `joints` (h,) [rad or m] are the positions of the h actuated joints.
     """
     return {name: float(q) for name, q in hand.expand(joints).items()}

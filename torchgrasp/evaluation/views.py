@@ -105,11 +105,11 @@ class EvaluationSpec(Value):
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
-    """Return the indices of the grasps to try, from 0 to `executable` - 1, where `executable` is
-    the number of a view's executable grasps.
+    """Return the indices of the grasps to try among a view's executable grasps.
 
-    At most `most` indices are returned. The grasps are in the order of their ranks, the best first.
-    `ranks` says which are tried: the "best", or grasps "spread" evenly over all ranks.
+    `executable` is the number of these grasps. At most `most` indices are returned. The grasps are
+    in the order of their ranks, the best first. `ranks` says which are tried: the "best", or grasps
+    "spread" evenly over all ranks.
     """
     most = min(most, executable)
     if ranks == "best" or most < 2:

@@ -97,13 +97,13 @@ def _numbers(words: str) -> list[float]:
 def read_columns(
     hand: Hand, columns: Sequence[Column], table: np.ndarray, refuse: Refuse
 ) -> dict[str, np.ndarray]:
-    """Return the values (g,) [rad or m] of the hand's joints in g grasps, by joint name, from the
-    numbers of another program's file.
+    """Return the values (g,) [rad or m] of the hand's joints in g grasps of another program's file,
+    by joint name.
 
-    `table` (g, n) has these numbers, a row for each grasp and a column for each of the n `columns`
-    (`read_order`). A `GraspFileWarning` names columns that are not read although they are not 0. It
-    also names joints that in every grasp are on the far shorter side of their range about 0. Their
-    sign may be reversed.
+    `table` (g, n) has the numbers of the file: a row for each grasp, a column for each of the n
+    `columns` (`read_order`). A `GraspFileWarning` names columns that are not read although they are
+    not 0. It also names joints that in every grasp are on the far shorter side of their range about
+    0. Their sign may be reversed.
 
     Raises an error for joints beyond their limits that fit with the other sign. `refuse` makes it
     from two texts: what was found, and what is allowed.
@@ -230,12 +230,13 @@ class _Fingers(Batch):
 def reach_tips(
     hand: Hand, joints: Float[Tensor, "g h"], tips: Float[Tensor, "g f 3"]
 ) -> tuple[Float[Tensor, "g h"], Float[Tensor, "g"]]:
-    """Return (joints, distance) for g grasps: actuated joints (g, h) [rad or m] that bring the
-    fingertips to the points `tips`, and the distance (g,) [m] that is left.
+    """Return joint positions (g, h) [rad or m] that bring fingertips to given points, then the
+    distance (g,) [m] that is left.
 
-    The contact points of the f fingertips come as near to `tips` (g, f, 3) [m] as the joint limits
-    allow. The distance is the greatest one of a fingertip from its point. `tips` are in the frame
-    of the hand's root link. The search starts at the argument `joints` (g, h) [rad or m].
+    `tips` (g, f, 3) [m] are the points for the contact points of f fingertips in g grasps. They are
+    in the frame of the hand's root link. Each grasp's distance is the greatest one of its
+    fingertips. The h actuated joints stay within their limits. The search starts at the argument
+    `joints` (g, h) [rad or m].
     """
 
     def errors(state: _Fingers, rows: Int[Tensor, "a"]) -> Residuals:

@@ -61,8 +61,8 @@ class OrderNumbers:
     grasps: int = 8
     """Least number of grasps from which the order is judged: of fewer, one side may be chance."""
     one_side: float = 0.9
-    """Bound of the mean over all grasps of the unit vector from the hand to the object's origin, in
-    the hand's frame. If the mean is at least this long, the origin counts as on one side.
+    """Least length of a mean over all grasps at which the object's origin counts as on one side. It
+    is the mean unit vector from the hand to this origin, in the hand's frame.
     """
     any_side: float = 0.6
     """Greatest length of this mean in the assumed order at which the assumed order is judged wrong.

@@ -192,7 +192,7 @@ def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -
     has at most `most` grasps, and no number in it exceeds `far` in size.
 
     A `GraspFileWarning` names keys that are not read. Another one is shown if neither the first
-    line nor the gripper's path names a hand: a left hand may have the joints of a right one.
+    line nor the gripper's path names a hand. A left hand may have the joints of a right one.
 
     Raises an error for a malformed file, another version, or a file that torchgrasp wrote for
     another hand. It is also raised for a joint that the hand does not have, or a missing actuated

@@ -243,11 +243,12 @@ def _scene(
 @checked
 def pressing_force(spec: TrialSpec, mass: Positive) -> float:
     """Return the normal force [N] with which the strongest finger presses in a folder of
-    `save_play`: `spec.force`, or what the object needs if `spec.force` is None.
+    `save_play`.
 
-    In this case two opposite fingers hold the weight of a `mass` [kg] and a push of 2.5 N (`PUSH`).
-    They do so with half of the mean friction coefficient, which counts as at least 0.1
-    (`PLAY.friction`). This force is at most `spec.max_force`, and at most 100 N (`PLAY.force`).
+    It is `spec.force`. If that is None, two opposite fingers hold the weight of a `mass` [kg] and a
+    push of 2.5 N (`PUSH`). They do so with half of the mean friction coefficient, which counts as
+    at least 0.1 (`PLAY.friction`). This force is at most `spec.max_force`, and at most 100 N
+    (`PLAY.force`).
 
     >>> round(pressing_force(TrialSpec(friction=0.8), 0.25), 1)
     6.2

@@ -155,8 +155,8 @@ def named_postures(
     joint positions of three postures.
 
     The `Squeeze` holds joint targets with which the fingers press, their forces and torques. The
-    dict `postures` has the keys "pregrasp", "grasp" and "squeeze". Each posture is a dict of the
-    positions (g,) [rad or m] of all movable joints of the URDF, by the joint's name.
+    dict `postures` has the keys "pregrasp", "grasp" and "squeeze". Each posture has the positions
+    (g,) [rad or m] of all movable joints of the URDF, by the joint's name.
 
     `force` [N] is the normal force of the strongest finger at the squeeze. `kp` [N m/rad] is the
     stiffness of every drive; None means the hand's own. Raises `BadArgument` for joints of
@@ -201,10 +201,10 @@ def _check_executable(hand: Hand, grasps: Grasps) -> None:
 
 
 def check_flange(flange: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return `flange`, the pose (4, 4) [m] of a robot's flange in the frame of the hand's root
-    link, in float64 on the CPU.
+    """Return `flange`, the pose (4, 4) [m] of a robot's flange, in float64 on the CPU.
 
-    Raises `BadArgument` if it is more than 1 m from the root link, as it is then not in metres.
+    It is in the frame of the hand's root link. Raises `BadArgument` if it is more than 1 m from the
+    root link, as it is then not in metres.
     """
     away = float(norm(flange[:3, 3]))
     if away > FARTHEST:
@@ -215,8 +215,8 @@ def check_flange(flange: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
 
 def stands_still(hand: Hand, grasps: Grasps) -> Bool[Tensor, "g"]:
     """Return a mask (g,) of the grasps in which the hand keeps its pose while it closes. In the
-    other grasps the hand goes down while it closes: at the pose of the grasp its opened fingers
-    would be in the table.
+    other grasps the hand goes down while it closes. The reason is that at the grasp's pose its
+    opened fingers would be in the table.
     """
     opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
     return (opened == grasps.obj_from_hand).all(2).all(1)

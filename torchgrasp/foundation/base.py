@@ -293,8 +293,8 @@ def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch
 
 
 def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
-    """Return a copy of the batch `whole` in which the a rows of the batch `part` replace the rows
-    with the indices `at` (a,). A row is what belongs to one index of the first axis.
+    """Return a copy of the batch `whole` in which the rows of the batch `part` replace the rows at
+    the indices `at` (a,). A row is what belongs to one index of the first axis; `part` has a rows.
     """
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
@@ -442,8 +442,8 @@ def check_device(name: str, found: torch.device, beside: str, wanted: torch.devi
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
-    """Return how often each `Status` occurs in a tensor (*b,) of status codes, as a dictionary with
-    the most frequent status first.
+    """Return how often each `Status` occurs in a tensor (*b,) of status codes. The most frequent
+    status comes first.
     """
     codes, counts = torch.unique(status, return_counts=True)
     pairs = sorted(zip(codes.tolist(), counts.tolist(), strict=True), key=lambda p: (-p[1], p[0]))

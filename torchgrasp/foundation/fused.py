@@ -68,11 +68,11 @@ def is_fused(*tensors: Tensor) -> bool:
 
 
 def are_on() -> bool:
-    """Return whether loops compiled by numba are on: the environment variable TORCHGRASP_FUSED is
-    "1", or it is unset or empty and numba can compile.
+    """Return whether loops compiled by numba are on.
 
-    Raises `MissingExtra` for "1" without numba, and `BadArgument` for values other than "0", "1" or
-    none.
+    They are on if the environment variable TORCHGRASP_FUSED is "1". They are also on if it is unset
+    or empty, and numba can compile. Raises `MissingExtra` for "1" without numba, and `BadArgument`
+    for values other than "0", "1" or none.
     """
     asked = os.environ.get(VARIABLE, "")
     if asked not in {"", "0", "1"}:

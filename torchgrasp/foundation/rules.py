@@ -320,7 +320,7 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
 
 def check_path(name: str, path: Path | str) -> None:
     """Raise `BadArgument` for a path that no file can have. It holds a NUL or half a character (a
-    lone surrogate), has over 4095 bytes, or a name of over 255 bytes.
+    lone surrogate), or is too long: over 4095 bytes, or 255 in one name.
 
     Errors call the path by `name`.
     """

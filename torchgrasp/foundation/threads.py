@@ -21,8 +21,8 @@ them.
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Return a context in which torch computes with one thread; the number of threads that torch
-    used before is restored afterwards.
+    """Return a context in which torch computes with one thread. Afterwards it has as many threads
+    as before.
     """
     if getattr(_here, "inside", False):
         yield

@@ -108,12 +108,12 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
 
 
 def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], float]:
-    """Return (centres, radius): the centres [m] of spheres that cover a collision shape, in the
-    frame of its link, and the radius [m] that they share.
+    """Return the centres [m] of spheres that cover a collision shape, then the radius [m] that all
+    of them have.
 
-    The shape is cut into cells of about the edge `cell` [m], with a sphere for each outer cell.
-    Each sphere is moved inward until it protrudes from a face by at most `bulge` [m]. A shape that
-    is a sphere is its own cover.
+    The centres are in the frame of the shape's link. The shape is cut into cells of about the edge
+    `cell` [m], with a sphere for each outer cell. Each sphere is moved inward until it protrudes
+    from a face by at most `bulge` [m]. A shape that is a sphere is its own cover.
     """
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]

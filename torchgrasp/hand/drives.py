@@ -41,10 +41,10 @@ def drive_efforts(hand: Hand) -> Float[Tensor, " j"]:
 
 
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return the stiffness (h,) [N m/rad] with which the drives hold each of h actuated joints,
-    together with the joints coupled to it.
+    """Return the stiffness (h,) [N m/rad] of each of h actuated joints, together with the joints
+    coupled to it.
 
-    It is the sum of the stiffnesses of these drives, each times its squared coupling ratio. `kp` [N
+    It is the sum of the stiffnesses of their drives, each times its squared coupling ratio. `kp` [N
     m/rad] replaces the stiffness of every drive; None means the hand's own. For sliding joints
     units are [N/m].
     """
@@ -52,8 +52,8 @@ def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
 
 
 def coupled_stiffness(hand: Hand, drives: Float[Tensor, " j"]) -> Float[Tensor, "h"]:
-    """Return the stiffness (h,) [N m/rad] with which the drives hold each of h actuated joints,
-    together with the joints coupled to it.
+    """Return the stiffness (h,) [N m/rad] of each of h actuated joints, together with the joints
+    coupled to it.
 
     `drives` (j,) [N m/rad] are the stiffnesses of the drives of all j movable joints of the URDF.
     The result is the sum of those that move with the actuated joint, each times its squared

@@ -138,12 +138,13 @@ class ActuatedJoints(Value):
 
 
 def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
-    """Return the actuated joints of a hand: those of the grasping fingers that follow no other
-    joint, and the joints that the coupled ones follow.
+    """Return the actuated joints of a hand with their limits and coupling.
 
-    `spec` is the content of hand.toml. Its limit margin is taken off both ends of each range.
-    Raises `HandFileError` if the margin leaves an empty range. Raises it also if the chosen option
-    of hand.toml gives no position to a joint that does not grasp.
+    They are the joints of the grasping fingers that follow no other joint. Joints that their
+    coupled joints follow are actuated, too. `spec` is the content of hand.toml. Its limit margin is
+    taken off both ends of each range. Raises `HandFileError` if the margin leaves an empty range.
+    Raises it also if the chosen option of hand.toml gives no position to a joint that does not
+    grasp.
     """
     movable = {j.name: j for j in urdf.movable}
     own = [j for f in spec.fingers for j in f.joints]

@@ -146,8 +146,8 @@ class Hand(Value):
 
     @kept
     def motion(self) -> FreeMotion:
-        """Matrices from which inverse kinematics computes how collision spheres, fingertips and pad
-        normals move in a small step of the hand's pose and joints.
+        """Matrices that tell how collision spheres, fingertips and pad normals move in a small step
+        of the hand's pose and joints.
 
         It is a cached property that only inverse kinematics uses, as in `solve_ik`. Its class
         `FreeMotion` is not public.

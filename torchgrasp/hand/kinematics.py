@@ -152,13 +152,13 @@ class KinematicTree(Value):
 
 @dataclasses.dataclass(frozen=True)
 class FreeMotion(Value):
-    """Matrices that tell how the links of a free-floating hand, and markers on them, move in a
-    small step of the hand's pose and joints.
+    """Matrices that tell how links of a free-floating hand, and markers on them, move in a small
+    step of its pose and joints.
 
-    A step has d = 6 + h numbers: 6 for the pose of the root link, and h for the actuated joints. It
-    gives the hand q motions. They are three translations along the root's axes, three rotations
-    about them, and the motion of each joint that an actuated joint moves. Each motion is a
-    translation or a rotation.
+    A step has d = 6 + h numbers: 6 for the root link's pose, and h for the actuated joints. It
+    gives the hand q motions, each a translation or a rotation. They are three translations along
+    the root's axes, and three rotations about them. Then comes the motion of each joint that an
+    actuated joint moves.
 
     A marker is a point or a direction that is fixed to a link. Markers come in groups. First come
     the given groups. Then come the origins, the rotation axes and the translation axes of all
@@ -218,11 +218,11 @@ class FreeMotion(Value):
         return cls(product.flatten(1), tuple(map(len, local)), moves, whole)
 
     def place(self, frames: Frames) -> tuple[Float[Tensor, "3 p n"], ...]:
-        """Return the coordinates (3, p, n) of each group of p markers in n postures, in the frame
-        of `frames`, such as that of the root link.
+        """Return the coordinates (3, p, n) of each group of p markers in n postures.
 
-        `frames` (3, 4, l, n) are the poses [m] of all l links, from `KinematicTree.frames`. Points
-        are in [m]; directions keep their lengths.
+        `frames` (3, 4, l, n) are the poses [m] of all l links, from `KinematicTree.frames`. The
+        result is in the same frame as they are, such as that of the root link. Points are in [m];
+        directions keep their lengths.
         """
         product = self.product.to(frames).expand(3, -1, -1)
         return torch.bmm(product, frames.flatten(1, 2)).split(self.sizes, 1)
@@ -231,8 +231,8 @@ class FreeMotion(Value):
 def map_points(
     frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "3 p n"]:
-    """Return the coordinates (3, p, n) [m] of p points, each fixed to a link, in the root's frame
-    and in n postures.
+    """Return the coordinates (3, p, n) [m] of p points on links, in the root's frame and n
+    postures.
 
     `frames` (3, 4, p, n) holds the pose (3 x 4) [m] of each point's link in the root's frame.
     `local` (p, 3) [m] holds the points in the frames of their links.
@@ -243,8 +243,8 @@ def map_points(
 def map_directions(
     frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "3 p n"]:
-    """Return the components (3, p, n) of p directions, each fixed to a link, in the root's frame
-    and in n postures. Their lengths and unit are those of `local`.
+    """Return the components (3, p, n) of p directions on links, in the root's frame and n postures.
+    Their lengths and unit are those of `local`.
 
     `frames` (3, 4, p, n) holds the pose (3 x 4) [m] of each direction's link in the root's frame.
     `local` (p, 3) holds the directions in the frames of their links.
@@ -345,10 +345,10 @@ def pose_in_carrier(
     chain: "pytorch_kinematics.chain.Chain", link: str
 ) -> tuple[str, Float[Tensor, "3 4"]]:
     """Return the name of a link's carrier, then the pose (3, 4) [m] of the link in the carrier's
-    frame, without the last row of the 4 x 4 matrix.
+    frame.
 
-    The carrier is the nearest link, the link itself or one above, that a joint moves directly. If
-    no joint moves any of them, it is the root link.
+    The last row of the 4 x 4 matrix is left out. The carrier is the nearest link, the link itself
+    or one above, that a joint moves directly. If no joint moves any of them, it is the root link.
     """
     *above, carrier = chain.parents_indices[chain.frame_to_idx[link]].tolist()
     pose = _tables(chain, 0)[0]

@@ -359,12 +359,12 @@ class BoxPairs(NamedTuple):
     half_b: Float[Tensor, "3 k"]  # half sizes [m] of box b along its axes
 
     def along_axes(self) -> Float[Tensor, "15 k"]:
-        """Return the separations (15, k) [m] of each pair of boxes along the 15 axes that may
-        separate them (Gottschalk et al., 1996).
+        """Return the separations (15, k) [m] of each pair of boxes along 15 candidate axes.
 
-        The three axes of box a come first, then those of b, then the nine cross products. The
-        largest separation of a pair is a lower bound of the distance. If it is negative, it is
-        minus the shortest translation that separates the boxes.
+        One of these axes separates the boxes if any does (Gottschalk et al., 1996). The three axes
+        of box a come first, then those of b, then the nine cross products. The largest separation
+        of a pair is a lower bound of the distance. If it is negative, it is minus the shortest
+        translation that separates the boxes.
         """
         a, b, gap, half_a, half_b = self
         rotation = (a[:, :, None] * b[:, None]).sum(0)  # b's axes in the frame of a
@@ -386,8 +386,8 @@ class BoxPairs(NamedTuple):
         return torch.cat([by_a, by_b, by_edges])
 
     def push(self, best: Int[Tensor, " c"]) -> Pushed:
-        """Return (directions, points), both (3, c) for c = k pairs: along which box b is pushed out
-        of box a, and where they touch.
+        """Return (directions, points) of c = k pairs, both (3, c): where box b is pushed out of box
+        a, and where they touch.
 
         `best` (c,) is the index of one of the 15 axes of `along_axes` for each pair. The direction
         is the unit vector of this axis that points towards box b. The contact point [m] is relative

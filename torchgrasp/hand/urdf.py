@@ -181,8 +181,8 @@ class Urdf:
 
 
 def pose_of(part: Joint | LinkShape) -> Float[np.ndarray, "4 4"]:
-    """Return the pose (4, 4) [m] of a joint's frame in the frame of its parent link, with the joint
-    at zero; or of a shape in the frame of its link.
+    """Return the pose (4, 4) [m] of a joint, in its parent link's frame and at position zero. For a
+    shape it is the pose in the frame of its link.
     """
     return rigid(rotation_from_rpy(part.rpy), real(part.xyz)).numpy()
 

@@ -114,7 +114,7 @@ class ContactSpec(Value):
 
     @checked
     def updated(self, result: ClosureResult) -> "ContactSpec":
-        """Return this spec with the friction coefficient that a closing of the hand has measured
+        """Return this spec with the friction coefficient that a closing has measured
         (`ClosureResult.friction`), to plan the next grasp.
 
         `result` is what `close_hand` returned. If its `friction` is None, the spec is returned as
@@ -205,10 +205,10 @@ class ContactSpec(Value):
         First come specs with a smaller `flat_radius`: those of 8, 6, 4 and 3 mm (`FLAT_RADII`) that
         are less than `below`.
 
-        With a table, three specs follow for the upper rim of a low object. They have a
-        `flat_radius` of 1 mm (`RIM`). There a fingertip on the table touches an inclined surface.
-        The estimated rim is too round, so its normals are too steep. Therefore the second spec
-        reduces two margins by half, and the third spec drops them. The first margin is that of the
+        With a table, three specs with a `flat_radius` of 1 mm (`RIM`) follow. They are for a low
+        object, whose inclined upper rim is touched by fingertips that rest on the table. The
+        estimated rim is too round, so its normals are too steep. Therefore the second spec reduces
+        two margins by half, and the third spec drops them. The first margin is that of the
         friction: `planned_friction` rises to `mean_friction`. The second is that of a `tip_radius`
         of None: it falls from at least 12 mm (`TIP_RADIUS`) to `radius`.
 
@@ -473,8 +473,8 @@ def default_holding(sensor: SensorModel, closing: ClosingMode) -> HoldingMode:
 
 
 def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
-    """Raise `BadArgument` if the closing and holding mode of a trial do not combine, or need more
-    than the sensor measures.
+    """Raise `BadArgument` if a closing and a holding mode do not combine, or need more than the
+    sensor measures.
 
     The modes are those of `TrialSpec`. The holding "law" needs the closing "uncertainty", "fixed"
     or "paper". After the closing "open_loop" neither "grip" nor "impedance" is possible.
