@@ -57,8 +57,8 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
     least two fingers touch it in most of the judged ticks. Since the pressing ended, it slipped in
     the hand by less than 20 mm and 30 degrees (`SLIP_DISTANCE`, `SLIP_ANGLE`).
 
-    `SLIPPED` means that it only slipped too far. Otherwise the status is `NOT_LIFTED` if the centre
-    never rose by half of the lift, and `DROPPED` if it did.
+    `SLIPPED` means that only the third condition failed. Otherwise the status is `NOT_LIFTED` if
+    the centre never rose by half of the lift, and `DROPPED` if it did.
     """
     half = 0.5 * lift_height
     rise = [float(tick.centre[2] - ticks[0].centre[2]) for tick in ticks]

@@ -62,8 +62,8 @@ def rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 
 
 def rounded_table(table: Plane) -> Plane:
-    """Return the `table` with its normal rounded to multiples of about 1e-9, and its offset to 1e-9
-    m. The plane of its edge, if any, is rounded likewise.
+    """Return the `table` with its numbers rounded: its normal to multiples of about 1e-9, its
+    offset to 1e-9 m. The plane of its edge, if any, is rounded likewise.
     """
     edge = None if table.edge is None else rounded_table(table.edge)
     return Plane(rounded(table.normal), round(table.offset, DECIMALS), edge)

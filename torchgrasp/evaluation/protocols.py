@@ -301,12 +301,12 @@ def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor
 def draw_object_poses(
     noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed
 ) -> Float[Tensor, "n 4 4"]:
-    """Return n = `count` random displacements of an object on its table, as rigid transforms (n, 4,
-    4) [m].
+    """Return n = `count` random displacements (n, 4, 4) [m] of an object on its table, as rigid
+    transforms.
 
-    The frame is one whose z axis is the table's normal. Each displacement shifts the object along x
-    and y, and turns it about the vertical through the point `pivot` (3,) [m]. `noise` bounds the
-    shift along each axis and the angle.
+    The z axis of their frame is the table's normal. Each displacement shifts the object along x and
+    y, and turns it about the vertical through the point `pivot` (3,) [m]. `noise` bounds the shift
+    along each axis and the angle.
     """
     pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)

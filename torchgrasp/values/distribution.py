@@ -327,8 +327,8 @@ class Distribution(Value):
 
         A part that is a single number is one node. An interval is cut into equal pieces, and their
         middles are the nodes. The greater an interval's probability, the more pieces it has. If the
-        distribution has more `parts` than `count`, the nodes are quantiles. They are those of (i +
-        1/2) / `count` for i = 0 to `count` - 1, each with the probability 1 / `count`.
+        distribution has more `parts` than `count`, the nodes are `count` quantiles. Their levels
+        are (i + 1/2) / `count` for i = 0 to `count` - 1. Each has the probability 1 / `count`.
 
         Raises `BadArgument` for a `count` out of range.
 
