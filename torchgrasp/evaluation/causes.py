@@ -38,8 +38,8 @@ def find_cause(tries: Sequence[LiftTry], trial: GraspTrial, spec: TrialSpec) -> 
 
     The cause is a key of the dict `CAUSES`, such as "toppled" or "too weak". `CAUSES` also holds
     the unit of the size, and a sentence that explains the cause. The result is ("", NaN) if the
-    object was held, or the simulation did not stay finite. `tries` are the results of the trial's
-    lifts, and `trial` and `spec` its input.
+    object was held, or the simulation did not stay finite. `tries` are the trial's lifts, as
+    `lift_grasps` returns them. `trial` and `spec` are the input of the trial.
     """
     truth = trial.truth
     *before, (row, lift) = tries
@@ -97,8 +97,8 @@ def _sizes(
 def tick_of(lift: ClosureResult, phase: int) -> int:
     """Return the index of the control tick in the record `lift` at which a phase of the lift ended.
 
-    The `phase` is 0 (approach), 1 (closing) or 2 (pressing). A phase whose end in
-    `ClosureResult.phases` is NaN gives the last tick.
+    A tick is a period of the controller. The `phase` is 0 (approach), 1 (closing) or 2 (pressing).
+    A phase that did not end, with NaN in `ClosureResult.phases`, gives the last tick.
     """
     end = lift.phases[phase]
     return int((lift.time - end).abs().argmin()) if bool(end.isfinite()) else len(lift.time) - 1
@@ -110,8 +110,9 @@ def moved_in_hand(
     """Return how far the object has moved [m] and turned [rad] in the hand since the pressing
     ended.
 
-    Both have one number for each of the t ticks of the record `lift`. `centre` [m] is the point of
-    the object whose motion counts, in the frame of the grasp.
+    Both are (t,), for the t control ticks of the record `lift`, and relative to the hand's root
+    link. Earlier ticks are compared with the end of the pressing, too. `centre` (3,) [m] is the
+    point of the true mesh whose motion counts. It is in the frame of the planned cloud.
     """
     hand_from_object = inverse(lift.hand_pose.double()) @ lift.object_pose.double()
     start = hand_from_object[tick_of(lift, 2)]

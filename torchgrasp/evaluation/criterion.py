@@ -48,7 +48,7 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
     """Return whether an object was held in a lift: `OK`, `SLIPPED`, `DROPPED` or `NOT_LIFTED`.
 
     Args:
-        ticks: the states at all ticks.
+        ticks: the states at all control ticks.
         pressed: index of the tick at which the pressing ended.
         judged: number of last ticks in which the fingers must touch the object.
         lift_height: height of the lift [m].
@@ -56,6 +56,9 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
     The object is held if three conditions are met. Its centre rose by at least half of the lift. At
     least two fingers touch it in most of the judged ticks. Since the pressing ended, it slipped in
     the hand by less than 20 mm and 30 degrees (`SLIP_DISTANCE`, `SLIP_ANGLE`).
+
+    `SLIPPED` means that only the third condition failed. Otherwise the status is `NOT_LIFTED` if
+    the centre never rose by half of the lift, and `DROPPED` if it did.
     """
     half = 0.5 * lift_height
     rise = [float(tick.centre[2] - ticks[0].centre[2]) for tick in ticks]
@@ -68,10 +71,10 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
 
 
 def motion_between(first: Tick, last: Tick, in_hand: bool = True) -> ObjectMotion:
-    """Return the motion [m] of the object's centre and its rotation [rad] from the control tick
-    `first` to `last`.
+    """Return how far the object's centre moved [m] and the object turned [rad] between two control
+    ticks, `first` and `last`.
 
-    They are relative to the hand, or to the world if not `in_hand`.
+    Both are relative to the hand's root link, or to the world if `in_hand` is False.
     """
     eye = torch.eye(4, dtype=torch.float64)
     start, end = (inverse(tick.hand_pose) if in_hand else eye for tick in (first, last))

@@ -168,7 +168,12 @@ class EdgeLift(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """Whether the last try held the object, as `close_hand` defines it; False without a try."""
+        """Whether the last try held the object; False without a try.
+
+        The object is held if three conditions are met. Its centre rose by at least half of the
+        lift. At least two fingers touch it at the end. It slipped by less than 20 mm and 30 degrees
+        in the closed hand.
+        """
         return bool(self.tries) and self.tries[-1].result.held
 
 
@@ -194,11 +199,14 @@ def lift_from_edge(
         plan: drag and grasps, from `plan_edge_grasps`. At least one grasp must be executable: it
             passed all checks.
         hand: the hand of the plan.
-        mesh: the true object [m], as for `drag_object`.
-        spec: parameters of both trials; None means the default of `drag_object`.
+        mesh: the true object [m], closed, in the frame of the plan: a trimesh, a file, or a
+            `GraspObject`.
+        spec: parameters of both trials. None means a table with a friction of 0.3, as planned by
+            default: `TrialSpec(table_friction=0.3)`.
         seed: seed of both trials.
         tries: largest number of grasps that are tried (`lift_grasps`).
-        parts: convex parts [m] of the mesh, as for `drag_object`.
+        parts: convex parts [m] of the mesh. None means those of a `GraspObject`, or those that
+            `convex_parts` computes.
         table: the true table, with its edge. None means that of the plan.
 
     Raises `BadArgument` for a plan of another hand or without an executable grasp. It is also

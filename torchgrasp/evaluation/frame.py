@@ -17,11 +17,12 @@ DECIMALS = 9  # decimals to which the offset [m] of a table is rounded
 
 
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return the pose [m] of the simulator's frame in the frame of the grasp.
+    """Return the pose (4, 4) [m] of the simulator's frame in the frame of the grasp.
 
-    The table is at z = 0 and its normal along z; the hand's root link is above the origin. The x
-    axis is along the hand's x axis. If that is steeper than 60 degrees, it is along the hand's y
-    axis. `obj_from_hand` is the hand's pose [m] in the frame of the grasp.
+    In the simulator's frame the table is at z = 0 and its normal along z. The hand's root link is
+    above the origin. The x axis is the level part of the hand's x axis. If the hand's x axis is
+    steeper than 60 degrees, the hand's y axis takes its place. The arguments, the `table` and the
+    hand's pose `obj_from_hand` [m], are in the frame of the grasp.
     """
     z = unit(table.normal.double())
     origin = obj_from_hand[:3, 3]
@@ -54,15 +55,15 @@ def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
 
 
 def rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Return numbers, rounded to multiples of a step of about 1e-9 (`FINE`). Their size should be
-    about 1.
+    """Return the `numbers` (*b,), each rounded to a multiple of about 1e-9 (`FINE`). They are of a
+    size of about 1, such as components of unit vectors.
     """
     return torch.round(numbers / FINE) * FINE
 
 
 def rounded_table(table: Plane) -> Plane:
-    """Return a table with rounded numbers, also those of its edge: to about 1e-9, offsets in
-    metres.
+    """Return the `table` with its numbers rounded: its normal to multiples of about 1e-9, its
+    offset to 1e-9 m. The plane of its edge, if any, is rounded likewise.
     """
     edge = None if table.edge is None else rounded_table(table.edge)
     return Plane(rounded(table.normal), round(table.offset, DECIMALS), edge)

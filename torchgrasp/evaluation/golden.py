@@ -59,7 +59,11 @@ class GoldenResult(NamedTuple):
 
 @checked
 def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
-    """Simulate each test case of the tuple `GOLDEN` in a `simulator`, and yield its result."""
+    """Simulate the shipped grasp of each test case in `GOLDEN` in a `simulator`. Yield for each
+    whether the hand held the object.
+
+    Raises `MissingExtra` if the simulator is not installed.
+    """
     for case in GOLDEN:
         thing = load_object(case.object)
         hand = load_hand(case.hand)

@@ -127,9 +127,11 @@ def _combine(sums: Float[Tensor, "*r c 2"], weights: Sequence[float]) -> Float[T
 
 @checked
 def format_share(share: Share, unit: str = "families") -> str:
-    """Return a success rate with its interval as text, in per cent.
+    """Return a success rate with its interval as text, such as "80.0 % [61.2, 93.1] of 40, 9
+    families".
 
-    `unit` is the plural name of the resampled units.
+    The interval [low, high] is in per cent. The number of trials follows, then that of the
+    resampled units. `unit` is the plural name of these units. NaN gives "nothing measured".
     """
     if math.isnan(share.value):
         return "nothing measured"

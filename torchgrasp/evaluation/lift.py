@@ -145,17 +145,25 @@ def close_hand(
 @checked
 @single_threaded
 def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResult:
-    """Run one trial: close the hand, lift the object and hold it; return the record.
+    """Run one simulated trial: close the hand, lift the object and hold it; return the record.
 
     `trial` has the hand, a single grasp and the true object. `spec` are the parameters of the
-    trial; None means `TrialSpec()`. `close_hand` says when the object is held, and lists the
-    errors.
+    trial; None means `TrialSpec()`. The object is held if three conditions are met. Its centre rose
+    by at least half of the lift. At least two fingers touch it at the end. It slipped by less than
+    20 mm and 30 degrees in the closed hand.
+
+    Raises `BadArgument` for a trial whose hand, grasp, mesh and table do not fit together. Raises
+    `MeshError` for a mesh that is missing, open or without volume, and `MissingExtra` without the
+    simulator.
     """
     return run_lift(TrialDriver(trial, TrialSpec() if spec is None else spec))
 
 
 def run_lift(driver: TrialDriver) -> ClosureResult:
-    """Run the lift trial that `driver` has checked, in a fresh scene, and return its record."""
+    """Run the lift trial of a `driver` in a fresh simulated scene, and return its record.
+
+    The hand closes, lifts the object and holds it. The `driver` has checked the trial.
+    """
     return RecordedLift(driver.open()).complete()
 
 

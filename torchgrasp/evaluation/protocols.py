@@ -132,8 +132,9 @@ class Protocol(Value):
 
     @property
     def task(self) -> GraspTask:
-        """The task of the protocol's trials, a lift or pulls, for `plan_grasps`, which predicts the
-        success in it.
+        """What a grasp must do in the protocol's trials: a lift, or pulls.
+
+        It is the argument `task` of `plan_grasps`, which predicts the success in this task.
 
         >>> find_protocol("dexgraspbench").task.describe()
         'pulls of 0.1 kg with 7 N'
@@ -245,9 +246,11 @@ def find_protocol(protocol: Protocol | str) -> Protocol:
 
 @checked
 def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]:
-    """Return the true pose of a hand, on the CPU in float64, given its planned pose and pose error.
+    """Return the true pose (4, 4) [m] of a hand in simulation, given its planned pose and its pose
+    error. It is on the CPU in float64.
 
-    The `error` is a rigid transform [m] in the frame of the planned hand; None means no error.
+    The planned pose `obj_from_hand` [m] and the result are in the same frame. The `error` is the
+    pose of the true hand in the frame of the planned hand; None means no error.
     """
     planned = obj_from_hand.to("cpu", torch.float64)
     if error is None:
@@ -257,11 +260,11 @@ def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]
 
 @checked
 def seed_of(seed: Seed, *names: str | int) -> int:
-    """Return the random seed for one purpose: a hash of an evaluation's seed and the purpose's
-    names.
+    """Return the random seed for one purpose: a hash of an evaluation's `seed` and the purpose's
+    `names`.
 
-    Draws for different objects, views, grasps or repetitions are independent of each other and of
-    their order.
+    The names are, for example, those of object and view, and the grasp's rank. Draws with different
+    names are independent of each other, and of the order of the draws.
     """
     digest = hashlib.sha256(json.dumps([seed, *names]).encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
@@ -269,9 +272,10 @@ def seed_of(seed: Seed, *names: str | int) -> int:
 
 @checked
 def draw_trial(trial: TrialSpec, seed: Seed) -> TrialSpec:
-    """Return the parameters of a trial, with friction and mass drawn if they are distributions.
+    """Return the parameters of a trial, in which friction and mass are single numbers. A
+    `Distribution` of one of them is replaced by a random draw.
 
-    The draws are independent, and depend only on `seed`, that of the trial.
+    The two draws are independent, and depend only on `seed`, that of the trial.
     """
     friction = Distribution.of(trial.friction).sample(1, seed_of(seed, "friction"))
     mass = Distribution.of(trial.mass).sample(1, seed_of(seed, "mass"))
@@ -280,10 +284,11 @@ def draw_trial(trial: TrialSpec, seed: Seed) -> TrialSpec:
 
 @checked
 def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Return n = `count` random pose errors of the hand, rigid transforms [m] in the frame of the
-    planned hand.
+    """Return n = `count` random pose errors (n, 4, 4) [m] of the hand. Each is the pose of the true
+    hand in the frame of the planned hand.
 
-    `noise` bounds them.
+    `noise` bounds the translation along each axis and the rotation about it. Both are drawn
+    uniformly.
     """
     generator = torch.Generator().manual_seed(seed)
     largest = torch.tensor([noise.rotation] * 3 + [noise.translation] * 3, dtype=torch.float64)
@@ -296,10 +301,12 @@ def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor
 def draw_object_poses(
     noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed
 ) -> Float[Tensor, "n 4 4"]:
-    """Return n = `count` random displacements [m] of an object on its table, as rigid transforms.
+    """Return n = `count` random displacements (n, 4, 4) [m] of an object on its table, as rigid
+    transforms.
 
-    They shift the object along the table, whose normal is z, and turn it about the vertical through
-    `pivot` (3,) [m]. `noise` bounds them.
+    The z axis of their frame is the table's normal. Each displacement shifts the object along x and
+    y, and turns it about the vertical through the point `pivot` (3,) [m]. `noise` bounds the shift
+    along each axis and the angle.
     """
     pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)
@@ -311,7 +318,8 @@ def draw_object_poses(
 
 
 def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tensor, "4 4"]:
-    """Return the pose error of the hand that is equivalent to a displacement of the object.
+    """Return the pose error (4, 4) [m] of the hand that is equivalent to a displacement of the
+    object: hand and object are then in the same relative pose.
 
     `object_pose` is the displacement and `obj_from_hand` the planned pose, both rigid transforms
     [m] in the frame of the grasp. The error is in the frame of the planned hand.
@@ -350,9 +358,9 @@ def draw_slide(noise: PoseNoise, seed: Seed) -> Float[Tensor, "3"]:
 def draw_push(
     force: Annotated[float, Range(0.0, 1000.0)], seed: Seed
 ) -> tuple[float, float, float]:
-    """Return a force (x, y, z) [N] of the size `force` [N] in a random direction.
+    """Return a force vector (x, y, z) [N] of the norm `force` [N] in a random direction.
 
-    All directions are equally likely.
+    All directions are equally likely, so the vector may be taken in any frame.
     """
     generator = torch.Generator().manual_seed(seed)
     x, y, z = (force * unit(torch.randn(3, generator=generator, dtype=torch.float64))).tolist()

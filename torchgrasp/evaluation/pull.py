@@ -97,9 +97,10 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
-    """Run the pull trial that `driver` has checked: grasp the object once, and pull it until one
-    pull fails.
+    """Run the pull trial that `driver` has checked, and return its result.
 
+    The hand grasps the object once. Pulls in six directions follow, until one fails. Every pull
+    starts from the same closed grasp, along -x, +x, -y, +y, -z and +z of the simulator's frame.
     `spec` gives the force and time of each pull, and the motion of the object at which it fails.
     """
     started = time.process_time()
@@ -167,12 +168,14 @@ def run_protocol(
     rank: Annotated[int, Range(0, 1000000)] = 0,
     draw: Annotated[int, Range(0, 1000000)] = 0,
 ) -> ProtocolResult:
-    """Run one trial of a grasp under a protocol: pulls, or a lift.
+    """Run one simulated trial of a grasp under a protocol, pulls or a lift, and return its outcome.
 
-    The result stores the grasp's `rank` among those of its view, and the number `draw` of the pose
-    error. With `protocol.tries` > 1 the trial may hold further grasps, which are tried where a lift
-    fails (`lift_grasps`). A force of the size `protocol.push` [N] in a direction drawn from the
-    trial's seed pushes the lifted object.
+    With `protocol.tries` > 1 the trial may hold further grasps, which are tried where a lift fails
+    (`lift_grasps`). A force of the size `protocol.push` [N] pushes the lifted object. Its direction
+    is drawn from the trial's seed.
+
+    The numbers `rank` and `draw` are only stored in the result. They are the grasp's rank among
+    those of its view, and the index of the trial's random pose error.
     """
     started = time.process_time()
     if protocol.push:

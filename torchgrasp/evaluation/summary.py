@@ -337,13 +337,18 @@ class Bin(NamedTuple):
 def judge(
     predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]
 ) -> dict[str, float | list[Bin]]:
-    """Return calibration measures, by name, of n predicted probabilities, given whether the trials
-    passed.
+    """Return calibration measures, by name, of n predicted probabilities of success, given whether
+    the n trials passed.
 
-    Trials with the same name in `units` count as dependent in the bins' confidence intervals.
-    "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for perfect
-    predictions and 0 for always predicting the mean. "auc" is the area under the ROC curve. "error"
-    is the expected calibration error over the "bins".
+    * "predicted", "passed": means of `predicted` (n,) and of `passed` (n,).
+    * "brier": mean squared error of the predictions.
+    * "skill": 1 for perfect predictions, and 0 for always predicting the mean.
+    * "auc": area under the ROC curve.
+    * "bins": list of `Bin`, each for an interval of width 0.1 of the prediction.
+    * "error": expected calibration error over these bins.
+
+    "skill" is NaN if all trials passed, or none. `units` has n names, such as the families of the
+    objects. Trials with the same name count as dependent in the bins' confidence intervals.
     """
     outcome = passed.to(predicted)
     brier = float((predicted - outcome).square().mean())

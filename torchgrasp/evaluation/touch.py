@@ -23,11 +23,11 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps, PointCloud
 
 Verdict = Literal["touches", "apart", "penetrates", "unseen"]
-"""Whether the fingertips of a grasp touch.
+"""Whether the fingertips of a grasp touch; the limit is by default 3 mm (`TOUCH.limit`).
 
 * touches: each fingertip is within the limit of the surface.
-* apart: a fingertip is farther off.
-* penetrates: no fingertip is, but one is deeper in the object than the limit.
+* apart: a fingertip is farther off the surface than the limit.
+* penetrates: none is apart, but a fingertip is deeper in the object than the limit.
 * unseen: the cloud does not show the surface at a fingertip; all others touch.
 """
 
@@ -120,9 +120,9 @@ def measure_touch(
     """Return the gaps between fingertips and an object at the planned posture of each grasp.
 
     A gap is the signed distance from the object's surface to the sphere of a fingertip's pad. The
-    pad is the part that touches objects. A pad that is no sphere has only its contact point. No
-    forces are taken into account, and no errors of the hand's pose. The space behind the points of
-    a cloud with a viewpoint counts as unseen.
+    pad is the part that touches objects. For a pad that is no sphere, the distance to its contact
+    point counts. No forces are taken into account, and no errors of the hand's pose. The space
+    behind the points of a cloud with a viewpoint counts as unseen.
 
     Args:
         hand: the hand of the grasps.

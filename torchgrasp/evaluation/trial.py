@@ -55,12 +55,14 @@ class TrialNumbers:
     unit_error: float = 1e-4
     """Greatest deviation from 1 of the length of the approach, a unit vector."""
     speed: float = 0.2
-    """Mean speed [m/s] of an unguarded approach."""
+    """Mean speed [m/s] of an approach in which touches do not stop the hand."""
     slack: float = 0.03
-    """Greatest distance [m] between contacts and mesh: objects may be a bit misplaced."""
+    """Distance [m] from the mesh beyond which a contact is off the mesh: objects may be a bit
+    misplaced.
+    """
     relooked: float = 1.5
-    """Factor by which the simulated hand's range of motion, after a second look, exceeds the
-    largest shift of `relocate`.
+    """Range of motion of the simulated hand for a second look. It is in multiples of the largest
+    displacement of the object that the look (`relocate`) tries at first.
     """
 
 
@@ -131,26 +133,27 @@ class GraspTrial:
 
 
 def check_truth(trial: GraspTrial) -> None:
-    """Raise `BadArgument` if over 70 % of the trial's contacts are over 30 mm off its mesh. The
-    grasps are then probably in another frame. It is also raised if the mesh does not stand on the
-    planned table.
+    """Raise `BadArgument` if over 70 % of the contacts of the trial's grasps are over 30 mm off the
+    true mesh. The grasps are then probably in another frame.
+
+    It is also raised if the mesh does not stand on the planned table (`Grasps.table`).
     """
     mesh = read_mesh(trial.truth.mesh)
     check_contacts(trial.grasp, mesh, TRIALS.slack, AGREEMENT.astray)
 
 
 class TrialDriver:
-    """A trial that is checked once and can run any number of times.
+    """A simulated trial of a grasp, which is checked once and can run any number of times.
 
-    Its constructor raises `BadArgument` for an invalid trial, and `MeshError` for a bad mesh, as
-    `close_hand` does.
+    Its constructor raises `BadArgument` if hand, grasp, mesh and table do not fit together. Raises
+    `MeshError` for a mesh that is missing, open or without volume.
 
     Attributes:
         spec: the parameters of the trial, with friction and mass drawn by the trial's seed.
         reference: the closing plan, derived from what the robot knows of the trial.
-        obj_from_world: pose [m] of the simulator's frame in the grasp's frame. If there is a true
-            table, the frame is upright on it. Numbers are then rounded, so that results are bitwise
-            invariant to rigid motion.
+        obj_from_world: pose (4, 4) [m] of the simulator's frame in the grasp's frame. If there is a
+            true table, the frame is upright on it. Numbers are then rounded, so that results are
+            bitwise invariant to rigid motion. Without one, both frames are the same.
     """
 
     def __init__(self, trial: GraspTrial, spec: TrialSpec) -> None:
@@ -231,14 +234,16 @@ class TrialDriver:
         return open_scene(spec, self.spec.simulator)
 
     def open(self) -> "TrialRun":
-        """Return a run of the trial in a fresh scene.
+        """Return a new run of the trial, in a fresh simulated scene.
 
         Raises `MissingExtra` if the simulator is not installed.
         """
         return TrialRun(self)
 
     def grasp_overlap(self) -> float:
-        """Return the penetration depth [m] of the hand into the object at the planned grasp."""
+        """Return the penetration depth [m] of the hand into the true object at the planned grasp,
+        before any force. It is at most 0 if they do not overlap.
+        """
         joints = joints_by_name(self.reference.hand, self.reference.joints)
         alone = {"approach": (0.0, 0.0, 0.0), "table": False, "neighbours": (), "self_pairs": ()}
         scene_spec = dataclasses.replace(self.scene_spec, joints=joints, **alone)
@@ -260,11 +265,11 @@ def _check_effects(trial: GraspTrial, spec: TrialSpec) -> None:
 
 
 def true_table(grasps: Grasps, truth: Truth) -> Plane:
-    """Return the table of a `truth`, in the frame of the grasp. If it has none, return a level
-    table at the mesh's lowest point.
+    """Return the true table of a trial (`Truth.table`), in the frame of the grasp. If it is None,
+    return the level table at the lowest point of the true mesh.
 
-    The level table ends where the table of the `grasps` ends. Raises `BadArgument` if the plane of
-    that edge is almost level.
+    The level table ends where the planned table (`Grasps.table`) ends. A table ends at its edge, a
+    second plane. Raises `BadArgument` if this edge plane is almost level.
     """
     if truth.table is not None:
         return truth.table
@@ -294,9 +299,9 @@ def derive_reference(
     sensor: SensorModel | None = None,
     max_force: float | None = None,
 ) -> ClosingReference:
-    """Return the closing plan, given all that the robot knows.
+    """Return the closing plan that the controller follows, from all that the robot knows.
 
-    It takes no `TrialSpec` or `Truth`, which hold numbers of the true world.
+    The function takes no `TrialSpec` or `Truth`, which hold numbers of the true world.
 
     Args:
         hand: the hand of the grasp.
@@ -373,7 +378,8 @@ class TrialRun:
         return self.overlap <= self.spec.overlap
 
     def keep(self) -> "Callable[[], TrialRun]":
-        """Return a function that returns new runs in the present state of this one.
+        """Return a function without arguments; each call returns a new run, in the state that this
+        run has now.
 
         The new runs continue with bitwise the same results as this one.
         """
@@ -383,10 +389,11 @@ class TrialRun:
         return lambda: copy.deepcopy(kept, {id(self.scene): reopen(), id(hand): hand})
 
     def approach(self) -> Iterator[None]:
-        """Move the opened hand straight to its pre-grasp.
+        """Move the opened hand straight to its pre-grasp; yield after every control tick.
 
-        If the controller guards the approach, a touch stops the hand. The object may be displaced
-        halfway (`Truth.slide`).
+        A touch stops the hand if `ClosingOptions.stops` is above 0. The hand must then have tactile
+        sensors, and know a table and a surface. The object is displaced halfway by `Truth.slide`,
+        if that is not None.
         """
         half = 0.5 * self.spec.approach
         if self.controller.approaching:
@@ -417,7 +424,7 @@ class TrialRun:
             self.slide = None
 
     def close(self) -> Iterator[None]:
-        """Close the fingers and press until the closing has ended."""
+        """Close the fingers and press until the closing ends; yield after every control tick."""
         self.observation = self.robot.tick(self.controller.targets)
         yield
         while not self.controller.closed:
@@ -458,8 +465,10 @@ class TrialRun:
         return math.nan, math.nan
 
     def strained(self) -> bool:
-        """Return whether a joint's drive needs at least its greatest torque to reach its target. In
-        the mode "grip" it needs this torque to grip.
+        """Return whether a joint's drive is at its limit: it needs its greatest torque, or more, to
+        reach its target.
+
+        In the holding mode "grip" the torque that the drive needs for the gripping force counts.
         """
         reference = self.robot.reference
         hold = self.controller.hold

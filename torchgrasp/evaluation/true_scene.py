@@ -60,10 +60,13 @@ def true_body(
     mass: float | None = None,
     obj_from_world: Float[Tensor, "4 4"] | None = None,
 ) -> Body:
-    """Return a mesh as a body in the simulator's frame, with its convex parts and its mass [kg].
+    """Return a closed mesh [m] as a body in the simulator's frame, with its convex parts and its
+    mass [kg].
 
-    A `mass` of None means that `spec` gives it. `obj_from_world` [m] is the pose of the simulator's
-    frame in the frame of the mesh. None means that both frames are the same.
+    `parts` of None are computed (`convex_parts`). A `mass` of None means that `spec` gives the
+    mass. It is then the mean of a `Distribution`, or follows from `spec.density`. `obj_from_world`
+    (4, 4) [m] is the pose of the simulator's frame in the frame of the mesh. None means that both
+    frames are the same.
     """
     mesh, parts = read_solid(mesh, parts)
     density = spec.density
@@ -77,14 +80,19 @@ def true_body(
 def edge_in_world(
     table: Plane, obj_from_world: Float[Tensor, "4 4"]
 ) -> tuple[float, float, float] | None:
-    """Return the edge of a true table as (x, y, offset) in the simulator's frame; None without an
-    edge. (x, y) is a horizontal unit vector that points off the table, and `offset` [m] the edge's
-    position along it. `obj_from_world` [m] is the pose of the simulator's frame in the table's
-    frame.
+    """Return the edge where a `table` ends as (x, y, offset) in the simulator's frame; None without
+    an edge.
+
+    (x, y) is a horizontal unit vector that points off the table, and `offset` [m] the edge's
+    position along it. `obj_from_world` (4, 4) [m] is the pose of the simulator's frame in the frame
+    of the `table`.
     """
     return edge_of(rounded_table(table.moved(inverse(obj_from_world))))
 
 
 def joints_by_name(hand: Hand, joints: Float[Tensor, " h"]) -> dict[str, float]:
-    """Return the positions [rad or m] of all joints of the URDF by name, given the actuated ones."""
+    """Return the positions [rad or m] of all movable joints of the URDF by name.
+
+    `joints` (h,) [rad or m] are the positions of the h actuated joints.
+    """
     return {name: float(q) for name, q in hand.expand(joints).items()}

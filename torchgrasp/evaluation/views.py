@@ -105,10 +105,11 @@ class EvaluationSpec(Value):
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
-    """Return the indices of the grasps to try, among a view's `executable` grasps.
+    """Return the indices of the grasps to try among a view's executable grasps.
 
-    At most `most` indices are returned. The grasps are in the order of their ranks, the best first.
-    `ranks` says which are tried: the "best", or grasps "spread" evenly over all ranks.
+    `executable` is the number of these grasps. At most `most` indices are returned. The grasps are
+    in the order of their ranks, the best first. `ranks` says which are tried: the "best", or grasps
+    "spread" evenly over all ranks.
     """
     most = min(most, executable)
     if ranks == "best" or most < 2:
@@ -127,18 +128,18 @@ class ObjectView:
 
     @property
     def score(self) -> ViewScore:
-        """A result for the view before planning. It has the names of object, view, family and
+        """The `ViewScore` of the view before planning. It has the names of object, view, family and
         group, but no grasps.
         """
         entry = read_entry(self.objects, self.object)
         return ViewScore(self.object, self.view, 0, 0.0, family=entry.family, group=entry.group)
 
     def file(self, folder: Path) -> Path:
-        """Return the path of the file in a folder that holds the view's grasps."""
+        """Return the path of the view's file of grasps below `folder`: OBJECT/VIEW.safetensors."""
         return folder / self.object / f"{self.view}.safetensors"
 
     def load_hand(self) -> Hand:
-        """Load the hand of the view, with the fingers that grasp."""
+        """Load the hand of the view from its folder, with the grasping fingers of `hand.option`."""
         return load_hand(self.hand.urdf_path.parent, self.hand.option)
 
 

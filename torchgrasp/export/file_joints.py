@@ -26,7 +26,9 @@ from torchgrasp.hand.kinematics import map_points
 
 @dataclasses.dataclass(frozen=True)
 class PostureNumbers:
-    """Bounds by which a file's posture counts as our hand's, and parameters of the fingers' fit."""
+    """Bounds by which a posture in another program's file counts as one of our hand. Also the
+    parameters of the search that moves its fingertips to given points (`reach_tips`).
+    """
 
     same_tip: float = 1e-4  # greatest distance [m] of a fingertip from that of the file
     same_joint: float = 1e-3  # greatest difference [rad or m] of a joint that moves no fingertip
@@ -54,12 +56,14 @@ class Column(NamedTuple):
 
 
 def read_order(hand: Hand, order: Sequence[str]) -> tuple[Column, ...]:
-    """Return the joints of a file's postures, one for each number. The words of `order` are JOINT,
-    JOINT:FACTOR or JOINT:FACTOR:OFFSET.
+    """Return how each number of a posture in another program's file becomes a joint of the `hand`.
 
-    A word that does not start with a joint of the hand names a joint that is not read. Raises
-    `BadArgument` for an actuated joint that is missing, or a name twice. Raises it also for a
-    factor that is no number or 0.
+    `order` has a word for each number of the posture: JOINT, JOINT:FACTOR or JOINT:FACTOR:OFFSET.
+    JOINT is the joint's name in the hand's URDF, and OFFSET is in [rad], or [m] for a sliding
+    joint. A word that does not start with a joint of the hand names a number that is not read.
+
+    Raises `BadArgument` for an actuated joint that is missing, or a name twice. Raises it also for
+    a factor that is no number or 0.
     """
     columns = list[Column]()
     for word in order:
@@ -93,12 +97,16 @@ def _numbers(words: str) -> list[float]:
 def read_columns(
     hand: Hand, columns: Sequence[Column], table: np.ndarray, refuse: Refuse
 ) -> dict[str, np.ndarray]:
-    """Return the values (g,) [rad or m] of the hand's joints in g grasps, by name. `table` has the
-    file's values, a row for each grasp and a column for each of `columns`.
+    """Return the values (g,) [rad or m] of the hand's joints in g grasps of another program's file,
+    by joint name.
 
-    A `GraspFileWarning` names the values that are not read, and the joints that bend backward in
-    every grasp. Raises the error that `refuse` makes for joints beyond their limits that fit with
-    the other sign.
+    `table` (g, n) has the numbers of the file: a row for each grasp, a column for each of the n
+    `columns` (`read_order`). A `GraspFileWarning` names columns that are not read although they are
+    not 0. It also names joints that in every grasp are on the far shorter side of their range about
+    0. Their sign may be reversed.
+
+    Raises an error for joints beyond their limits that fit with the other sign. `refuse` makes it
+    from two texts: what was found, and what is allowed.
     """
     unread = list[str]()
     turned = dict[str, str]()  # what was found, by JOINT:-1
@@ -157,13 +165,15 @@ def _is_backward(values: np.ndarray, low: float, high: float) -> bool:
 def read_posture(
     hand: Hand, values: dict[str, np.ndarray], what: str, refuse: Refuse
 ) -> Float[Tensor, "g h"]:
-    """Return the h actuated joints [rad or m] of the hand in g grasps, on the CPU. `values` holds
-    the file's values (g,) of its joints by name.
+    """Return the positions (g, h) [rad or m] of the hand's h actuated joints in g grasps, on the
+    CPU. `values` holds the file's values (g,) [rad or m] of the hand's joints, by name.
 
-    All values together must put each fingertip where the actuated joints alone put it, to 0.1 mm.
-    Else the error that `refuse` makes is raised, which names the joint. A `GraspFileWarning` names
-    joints of fingers that do not grasp, whose values are not kept. `what` is the posture's name in
-    these texts.
+    The file may have values of coupled joints, too. All values together must put each fingertip
+    where the actuated joints alone put it, to 0.1 mm. Else an error is raised, which names the
+    joint. `refuse` makes it from two texts: what was found, and what is allowed.
+
+    A `GraspFileWarning` names joints of fingers that do not grasp, whose values are not kept.
+    `what` is the posture's name in these texts, such as "grasp".
     """
     joints = torch.tensor(np.stack([values[name] for name in hand.joint_names], axis=1))
     own = hand.expand_joints(joints)
@@ -220,11 +230,13 @@ class _Fingers(Batch):
 def reach_tips(
     hand: Hand, joints: Float[Tensor, "g h"], tips: Float[Tensor, "g f 3"]
 ) -> tuple[Float[Tensor, "g h"], Float[Tensor, "g"]]:
-    """Return h actuated joints [rad or m] within their limits that bring the contact points of f
-    fingertips to `tips` [m]. Return also the greatest distance [m] that is left between them, for
-    each of g grasps.
+    """Return joint positions (g, h) [rad or m] that bring fingertips to given points, then the
+    distance (g,) [m] that is left.
 
-    `tips` are in the frame of the hand's root link. The search starts at `joints`.
+    `tips` (g, f, 3) [m] are the points for the contact points of f fingertips in g grasps. They are
+    in the frame of the hand's root link. Each grasp's distance is the greatest one of its
+    fingertips. The h actuated joints stay within their limits. The search starts at the argument
+    `joints` (g, h) [rad or m].
     """
 
     def errors(state: _Fingers, rows: Int[Tensor, "a"]) -> Residuals:

@@ -54,15 +54,15 @@ LEAST = 1e-12  # least length [m] by which a position is divided
 
 @dataclasses.dataclass(frozen=True)
 class OrderNumbers:
-    """Bounds by which the quaternions of a file are found to have another order than assumed. In
-    the right order, the object's origin is on one side of most hands.
+    """Bounds by which the quaternions of a file are found to have another order (w first or last)
+    than assumed. In the right order, the object's origin is on one side of most hands.
     """
 
     grasps: int = 8
     """Least number of grasps from which the order is judged: of fewer, one side may be chance."""
     one_side: float = 0.9
-    """Least length of the mean unit vector to the object's origin, in the hands' frames. From this
-    length on, the origin counts as on one side.
+    """Least length of a mean over all grasps at which the object's origin counts as on one side. It
+    is the mean unit vector from the hand to this origin, in the hand's frame.
     """
     any_side: float = 0.6
     """Greatest length of this mean in the assumed order at which the assumed order is judged wrong.
@@ -459,8 +459,8 @@ def _at_rest(
 def read_poses(
     numbers: np.ndarray, quaternion: Quaternion, unit_m: float = 1.0
 ) -> Float[Tensor, "g 4 4"]:
-    """Return pose matrices [m] from `numbers` (g, 7): a position, then a unit quaternion in the
-    given order.
+    """Return the rigid transforms (g, 4, 4) [m] that `numbers` (g, 7) describe. Each row holds a
+    position, then a unit quaternion in the order `quaternion`, "wxyz" or "xyzw".
 
     One unit of the positions is `unit_m` [m].
 
@@ -559,8 +559,7 @@ def grasps_from_joints(
             None means that there is no table, or that it is unknown.
         spec: friction and number of cone edges of the certificate; None means `ContactSpec()`.
         std_m: standard deviation [m] of the surface at each contact, 0 to 0.1, for closing modes
-            that use it.
-            None means unknown.
+            that use it. None means unknown.
 
     Raises `BadArgument` for wrong shapes, joints outside their limits, or poses that are not rigid.
 

@@ -188,13 +188,15 @@ class IsaacFile(NamedTuple):
 
 
 def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -> IsaacFile:
-    """Return the content of an `isaac_grasp` file of at most `most` grasps. No number may exceed
-    `far` in size.
+    """Return the content of an `isaac_grasp` file: poses and joint values of the `hand`. The file
+    has at most `most` grasps, and no number in it exceeds `far` in size.
 
-    A `GraspFileWarning` names keys that are not read. The warning also says if neither the first
-    line nor the gripper's path names a hand: a left hand may have the joints of a right one. Raises
-    the error that `refuse` makes for a malformed file, another version, or our own file of another
-    hand. It is also raised for a joint that the hand does not have, or a missing actuated joint.
+    A `GraspFileWarning` names keys that are not read. Another one is shown if neither the first
+    line nor the gripper's path names a hand. A left hand may have the joints of a right one.
+
+    Raises an error for a malformed file, another version, or a file that torchgrasp wrote for
+    another hand. It is also raised for a joint that the hand does not have, or a missing actuated
+    joint. `refuse` makes the error from two texts: what was found, and what is allowed.
     """
     data = read_bounded(path, JSON_BYTES, ALLOWED, refuse)
     content = _read_yaml(path, data, refuse).entries("format", "format_version", "grasps")

@@ -139,10 +139,11 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
 
 
 def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
-    """Return the pose [m] of the hand's root link in DexGraspBench's frame of the hand. Then return
-    the joint names in DexGraspBench's order.
+    """Return (pose, names) for DexGraspBench, which has a hand frame and a joint order of its own.
 
-    They are the identity and () for a hand that DexGraspBench does not have.
+    The pose (4, 4) [m] is that of the hand's root link in DexGraspBench's hand frame. The names are
+    those of the joints in its order. For a hand that DexGraspBench does not have, they are the
+    identity and ().
     """
     turn, order = BENCH_HANDS.get(hand.name, ([0.0, 0.0, 0.0, 1.0], ()))
     rotation = torch.from_numpy(spatial.transform.Rotation.from_quat(turn).as_matrix())

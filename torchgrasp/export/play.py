@@ -64,7 +64,9 @@ class PlayNumbers:
     """Parameters of an exported motion that a simulator plays: mount, approach and lift."""
 
     room: float = 0.1
-    """Range of motion [m] of the hand's mount beyond approach and lift."""
+    """Range of motion [m] of the hand's mount, the joints that carry the hand, beyond approach and
+    lift.
+    """
     speed: float = 0.2
     """Speed [m/s] of the approach: the mean speed in our trials."""
     lift: float = 1.0
@@ -115,7 +117,8 @@ def save_play(
 
     Raises:
         BadArgument: there are no grasps, grasps failed a check, joints are of another hand, or the
-            grasps do not touch the mesh. Also a plan with an edge of the table for a player other than "mujoco".
+            grasps do not touch the mesh.
+        BadArgument: the planned table has an edge, and the player is not "mujoco".
         MeshError: the mesh is open or malformed.
         OutputError: a file cannot be written.
 
@@ -175,11 +178,11 @@ def save_play(
 
 
 def stand(surface: Surface, table: Plane | None) -> Surface:
-    """Return an estimated surface whose points below the table are moved up to it, along its
-    normal.
+    """Return an estimated surface whose vertices below the table are moved up to the table's plane,
+    along its normal. So the object stands on a flat base.
 
-    On the round base of an estimated surface the object would rock. Without a table, the surface is
-    returned as it is.
+    On the round base of an estimated surface the object would rock. Surface and table are in one
+    frame. For a `table` of None the surface is returned as it is.
     """
     if table is None:
         return surface
@@ -239,12 +242,13 @@ def _scene(
 
 @checked
 def pressing_force(spec: TrialSpec, mass: Positive) -> float:
-    """Return the normal force [N] of the strongest finger in play: `spec.force`, or what the object
-    needs if that is None.
+    """Return the normal force [N] with which the strongest finger presses in a folder of
+    `save_play`.
 
-    If it is None, two opposite fingers hold the weight of a `mass` [kg] and a push of 2.5 N
-    (`PUSH`). They do so with half of the friction coefficient. This force is at most
-    `spec.max_force`, and at most 100 N (`PLAY.force`).
+    It is `spec.force`. If that is None, two opposite fingers hold the weight of a `mass` [kg] and a
+    push of 2.5 N (`PUSH`). They do so with half of the mean friction coefficient, which counts as
+    at least 0.1 (`PLAY.friction`). This force is at most `spec.max_force`, and at most 100 N
+    (`PLAY.force`).
 
     >>> round(pressing_force(TrialSpec(friction=0.8), 0.25), 1)
     6.2
@@ -323,12 +327,13 @@ def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
 
 
 def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
-    """Return the values with which the templates of USD files are filled, by name.
+    """Return the description of a scene's object and hand that fills the templates of USD files:
+    three lists, by name.
 
-    Each is a list. "parts" has an entry for each convex part of the object. "links" and "joints"
-    have one for each link or joint of the hand and of the mount that carries it. All joints are at
-    zero. Lengths are in metres, masses in kilograms. Raises `BadArgument` for names of links or
-    joints that USD does not allow.
+    "parts" has an entry for each convex part of the object. "links" and "joints" have one for each
+    link or joint of the hand, and of the mount that carries the hand. The poses of links are those
+    with all joints at zero. Lengths are in metres, masses in kilograms. Raises `BadArgument` for
+    names of links or joints that USD does not allow.
     """
     urdf = scene.urdf
     moment = PLAY.inertia

@@ -151,12 +151,16 @@ def format_grasps(
 def named_postures(
     hand: Hand, grasps: Grasps, force: float, kp: float | None
 ) -> tuple[Squeeze, dict[str, dict[str, Float[Tensor, "g"]]]]:
-    """Return the `Squeeze` of g grasps, then the joint positions [rad or m] of each posture, by
-    name, on the CPU.
+    """Return (squeeze, postures) for g grasps, on the CPU: the pressing of the fingers, and the
+    joint positions of three postures.
 
-    The postures are "pregrasp", "grasp" and "squeeze". Each has the g positions of every joint of
-    the URDF, by the joint's name. `force` [N] is the normal force of the strongest finger. `kp` [N
-    m/rad] is the stiffness of every drive; None means the hand's.
+    The `Squeeze` holds joint targets with which the fingers press, their forces and torques. The
+    dict `postures` has the keys "pregrasp", "grasp" and "squeeze". Each posture has the positions
+    (g,) [rad or m] of all movable joints of the URDF, by the joint's name.
+
+    `force` [N] is the normal force of the strongest finger at the squeeze. `kp` [N m/rad] is the
+    stiffness of every drive; None means the hand's own. Raises `BadArgument` for joints of
+    executable grasps beyond their limits, or an approach that is no unit vector.
     """
     hand = hand.to("cpu")
     grasps = grasps.to("cpu")
@@ -171,10 +175,10 @@ def named_postures(
 
 
 def check_all_executable(grasps: Grasps) -> None:
-    """Raise `BadArgument` for grasps that failed a check, as the result of `plan_grasps` may have.
+    """Raise `BadArgument` if one of the grasps failed a check of the planner (`Grasps.status`).
 
-    Formats that have no place for a status call it: a robot would play these grasps, too. Imported
-    grasps without force closure are taken (`grasps_from_joints`): their true contacts are unknown.
+    Exports call it for formats without a status: a robot would play a failed grasp, too. Imported
+    grasps (`grasps_from_joints`) may lack force closure, since their true contacts are unknown.
     """
     planned = "seed" in grasps.meta
     taken = {Status.OK} if planned else {Status.OK, Status.NOT_CLOSED}
@@ -197,9 +201,10 @@ def _check_executable(hand: Hand, grasps: Grasps) -> None:
 
 
 def check_flange(flange: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return the pose [m] of a flange in the hand's frame, in float64 on the CPU.
+    """Return `flange`, the pose (4, 4) [m] of a robot's flange, in float64 on the CPU.
 
-    Raises `BadArgument` for one so far from the hand that it is not in metres.
+    It is in the frame of the hand's root link. Raises `BadArgument` if it is more than 1 m from the
+    root link, as it is then not in metres.
     """
     away = float(norm(flange[:3, 3]))
     if away > FARTHEST:
@@ -209,17 +214,19 @@ def check_flange(flange: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
 
 
 def stands_still(hand: Hand, grasps: Grasps) -> Bool[Tensor, "g"]:
-    """Return a mask of the g grasps in which the hand keeps its pose while it closes. In the others
-    it goes down while it closes, because its opened fingers would be in the table.
+    """Return a mask (g,) of the grasps in which the hand keeps its pose while it closes. In the
+    other grasps the hand goes down while it closes. The reason is that at the grasp's pose its
+    opened fingers would be in the table.
     """
     opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
     return (opened == grasps.obj_from_hand).all(2).all(1)
 
 
 def check_still(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` if the hand goes down while it closes in one of the grasps.
+    """Raise `BadArgument` if the hand must go down while it closes in one of the grasps.
 
-    A format with one pose for each grasp cannot express them.
+    It must do so if its opened fingers would be in the table at the pose of the grasp. A format
+    with one pose for each grasp cannot express this motion.
     """
     if not bool(stands_still(hand, grasps).all()):
         found = "a hand that goes down while it closes"
@@ -227,10 +234,12 @@ def check_still(hand: Hand, grasps: Grasps) -> None:
 
 
 def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str]:
-    """Return the robot's name of each joint of the hand's URDF. The joints in `rename` come first,
-    in its order; None keeps all names.
+    """Return a dict from the name of each movable joint in the hand's URDF to its name on the
+    robot.
 
-    Raises `BadArgument` for joints that the hand lacks, and for equal or empty names.
+    `rename` is such a dict of some joints. These joints come first, in its order; the others keep
+    their names. None keeps all names. Raises `BadArgument` for joints that the hand lacks, and for
+    equal or empty names.
     """
     given = dict(rename or {})
     ours = hand.tree.joint_names

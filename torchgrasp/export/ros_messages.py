@@ -180,8 +180,9 @@ def format_trajectories(
 def format_motion(hand: Hand, motion: ArmMotion, actuated: bool = False) -> str:
     """Return the trajectories of arm and hand as text, one YAML document for each grasp.
 
-    Each document is a ROS message trajectory_msgs/JointTrajectory. Positions are in [rad], or [m]
-    for sliding joints. `time_from_start` is in seconds.
+    Each document is a ROS message trajectory_msgs/JointTrajectory, with a point for each of
+    `motion.times`. Positions are in [rad], or [m] for sliding joints. `time_from_start` is in
+    seconds.
 
     Args:
         hand: the hand on the arm.

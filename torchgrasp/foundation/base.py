@@ -32,12 +32,12 @@ SomeBatch = TypeVar("SomeBatch", bound="Batch")
 
 
 def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValue:
-    """Return a value in which each tensor is the result of `function`, called with that field's
-    tensors in all `values`.
+    """Return one value, each of whose tensors is `function` of the tensors in the same field of all
+    `values`.
 
-    The `values` are of one class; `function` gets one tensor from each. Values in fields are
-    mapped, too. Fields without tensors are copied from the first value. Raises `BadArgument` if a
-    field holds a tensor in some of the values only.
+    The `values` are of one class; `function` takes one tensor of each. Values in fields are mapped,
+    too. Fields without tensors are copied from the first value. Raises `BadArgument` if a field
+    holds a tensor in some of the values only.
     """
 
     def merge(name: str, *found: Any) -> Any:
@@ -63,7 +63,8 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
 
 
 class kept(functools.cached_property[Kept]):
-    """A cached property whose value is a tensor, or holds tensors.
+    """A decorator for cached properties whose value is a tensor, or holds tensors. It is like
+    `functools.cached_property`.
 
     Inside a transform of torch.func nothing is cached, because the tensors of the transform are
     invalid after it.
@@ -274,6 +275,8 @@ def read_rows(rows: Any, count: int) -> slice | Tensor:
 def join(parts: Sequence[SomeBatch]) -> SomeBatch:
     """Return one batch: the tensors of several batches, concatenated along their first axis. Fields
     without tensors are copied from the first batch.
+
+    Raises `BadArgument` if a field holds a tensor in some of the batches only.
     """
     return map_tensors(lambda *tensors: torch.cat(tensors), *parts)
 
@@ -281,6 +284,8 @@ def join(parts: Sequence[SomeBatch]) -> SomeBatch:
 def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch:
     """Return a batch that takes each row from `new` where `choose` is True, and from `old` where it
     is False. A row is what belongs to one index of the first axis.
+
+    The batches `new` and `old` have b rows each. Fields without tensors are those of `new`.
     """
     return map_tensors(
         lambda a, b: torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b), new, old
@@ -288,8 +293,8 @@ def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch
 
 
 def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
-    """Return a copy of the batch `whole` in which the rows of `part` replace those at the indices
-    `at`. A row is what belongs to one index of the first axis.
+    """Return a copy of the batch `whole` in which the rows of the batch `part` replace the rows at
+    the indices `at` (a,). A row is what belongs to one index of the first axis; `part` has a rows.
     """
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
@@ -307,10 +312,10 @@ def spread(value: float | Tensor, like: Tensor, own: int = 0) -> float | Tensor:
 
 
 def at_once(x: Tensor, size: int) -> int:
-    """Return how many rows of the tensor `x` to process at a time.
+    """Return how many rows of the tensor `x`, along its first axis, to process at a time.
 
-    On a CPU the number is `size`, so that its cache holds all temporaries. On an accelerator it is
-    256 times `size` (`ROWS_ON_GPU`).
+    The argument `size` is this number on a CPU, whose cache then holds all temporaries. On an
+    accelerator, such as a GPU, the result is 256 times `size` (`ROWS_ON_GPU`).
     """
     return size if x.device.type == "cpu" else ROWS_ON_GPU * size
 
@@ -319,10 +324,10 @@ def in_chunks(
     evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int
 ) -> tuple[Any, ...]:
     """Return the outputs of a function for all rows of `x`, computed in chunks of `size` rows to
-    save memory.
+    save memory. A row is one index of the first axis.
 
-    `evaluate` takes a tensor (at most `size`, ...), and returns tensors with as many rows. The
-    outputs of the chunks are concatenated.
+    `evaluate` takes a tensor (at most `size`, ...), and returns a tuple of tensors with as many
+    rows. Each output is concatenated over the chunks.
     """
     if len(x) <= size:
         return evaluate(x)
@@ -335,13 +340,17 @@ def map_rows(
     axes: tuple[int | None, ...],
     arguments: tuple[Tensor, ...],
 ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    """Return the results of a function for all entries of a torch.vmap at once. Return then the
-    axis of the entries in each result, which is 0.
+    """Return (results, axes) for a function under torch.vmap, called once for all entries of the
+    mapped axis. The results have the mapped axis first, so all returned axes are 0.
 
-    It serves as the method `vmap` of a torch.autograd.Function. `function` takes tensors (n, ...)
-    of n rows, and returns tensors of n rows. The rows of all entries are computed in one call.
-    `size` is the number of entries, and `axes` are their axes in the `arguments`. None means that
-    all entries share the argument.
+    A torch.autograd.Function calls this in its method `vmap`. `function` takes tensors (n, ...) of
+    n independent rows, and returns tensors of n rows. The rows of all entries are stacked for it.
+
+    Args:
+        function: the function of rows.
+        size: length of the mapped axis.
+        axes: the mapped axis of each argument; None means that all entries share the argument.
+        arguments: the tensors (n, ...), each with the mapped axis at its place in `axes`.
     """
     parts = [
         x.expand(size, *x.shape) if axis is None else x.movedim(axis, 0)
@@ -404,16 +413,17 @@ def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
 
 
 def changes_in_place(*tensors: Tensor) -> int:
-    """Return how often tensors were changed in place, so that a cached value can be told old.
+    """Return how often the `tensors` were changed in place since they were made, all together.
 
-    Changes of inference mode, which torch does not count, are left out.
+    A value that was computed from them is out of date once this number has grown. Tensors made in
+    inference mode count 0, because torch does not count their changes.
     """
     return sum(0 if x.is_inference() else x._version for x in tensors)
 
 
 def settle(value: SomeValue, device: torch.device) -> SomeValue:
-    """Return a value on a device. A value that is already on it is returned itself, with its cached
-    properties.
+    """Return `value` with all its tensors on the device `device`. A value that is already there is
+    returned itself, with its cached properties.
     """
     there = all(x.device == device for x in named_tensors(value).values())
     return value if there else value.to(device)
@@ -432,8 +442,8 @@ def check_device(name: str, found: torch.device, beside: str, wanted: torch.devi
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
-    """Return how often each `Status` occurs in a tensor of status codes, the most frequent one
-    first.
+    """Return how often each `Status` occurs in a tensor (*b,) of status codes. The most frequent
+    status comes first.
     """
     codes, counts = torch.unique(status, return_counts=True)
     pairs = sorted(zip(codes.tolist(), counts.tolist(), strict=True), key=lambda p: (-p[1], p[0]))

@@ -99,16 +99,18 @@ def checked(thing: Checked) -> Checked: ...
 @overload
 def checked(*, gradients: bool) -> Callable[[Checked], Checked]: ...
 def checked(thing: Any = None, *, gradients: bool = False) -> Any:
-    """Return a function, or the class of a value, that checks its arguments against their
-    annotations.
+    """Return the function or dataclass `thing` with a check of its arguments against their
+    annotations. A wrong argument raises `BadArgument`.
 
-    It is used as a decorator. A class checks its fields when a value is made. NumPy numbers become
-    Python numbers. If an argument is a value, its fields are checked again. In a method, a letter
-    in a shape has the same size as in the fields of the object. A value without `__post_init__`
-    that the library makes from tensors is not checked. With `gradients` True, the function is
-    differentiable: it takes tensors that require a gradient, dual tensors and tensors inside a
-    transform of torch.func, which other functions refuse. Numbers inside torch.vmap and arguments
-    inside torch.compile are not checked. A wrong argument raises `BadArgument`.
+    It is used as a decorator. Type, shape, dtype and range are checked, and that numbers are
+    finite. NumPy numbers become Python numbers. A class checks its fields when an object is made.
+    If an argument is a `Value`, its fields are checked again. In a method, a letter in a shape has
+    the same size as in the fields of the object. A `Value` without `__post_init__` that the library
+    makes from tensors is not checked.
+
+    With `gradients` True, the function is differentiable. It then takes tensors that require a
+    gradient, dual tensors and tensors inside a transform of torch.func. Other functions refuse
+    them. Numbers inside torch.vmap and arguments inside torch.compile are not checked.
     """
     if thing is None:
         return functools.partial(checked, gradients=gradients)
@@ -268,10 +270,11 @@ def _refuse_gradients(name: str, value: Any) -> None:
 
 
 def read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
-    """Return a value as int, float or bool, which `kind` names.
+    """Return `value`, a Python or NumPy number, as a Python number of the type `kind`: int, float
+    or bool.
 
-    Raises `BadArgument` if the value is of another kind or outside the range `allowed`; None allows
-    every number. Errors call the value by `name`.
+    Raises `BadArgument` if the value is of another type or outside the range `allowed`; None allows
+    every number. A whole number also counts as a float. Errors call the value by `name`.
     """
     # A comparison of float32 with the ends of a range would overflow.
     number: Any = value.item() if isinstance(value, np.generic) else value

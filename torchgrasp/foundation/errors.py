@@ -50,7 +50,9 @@ class BadArgument(GraspError, ValueError):
 
 
 def one_line(told: object) -> str:
-    """Return an error, a warning or a text as one line, without breaks and double spaces."""
+    """Return the text of an error, a warning or any object as one line, without line breaks and
+    double spaces.
+    """
     return " ".join(str(told).split())
 
 
@@ -68,7 +70,9 @@ def _suggest(found: str, allowed: str) -> str:
 
 
 class TooFewPoints(BadArgument):
-    """A cloud has too few points to estimate a surface, mostly fewer than 4 distinct ones."""
+    """A cloud has too few points to estimate a surface. Most functions need at least 4 distinct
+    points.
+    """
 
 
 class SuspiciousScale(BadArgument):
@@ -116,8 +120,9 @@ class OutputError(BadArgument):
 class MissingExtra(GraspError, ImportError):
     """A package that an optional feature needs is not installed.
 
-    `package` is its name, and `extra` the extra of torchgrasp that installs it. `asked` is the
-    setting that asks for it, where the call does not show it.
+    `package` is its name, and `extra` the extra of torchgrasp that installs it. The message names
+    both. `asked` is a setting that needs the package, such as "TORCHGRASP_FUSED=1"; it is empty if
+    the call itself shows the need.
     """
 
     def __init__(self, package: str, extra: str, asked: str = ""):
@@ -141,6 +146,7 @@ class IndefiniteCovariance(GraspError, ValueError):
     """A covariance matrix is not positive definite; `smallest_eigenvalue` is its least eigenvalue.
 
     The library never adds a multiple of the identity (jitter) to make a matrix positive definite.
+    The message names the matrix (`what`) and a remedy (`fix`).
     """
 
     def __init__(self, what: str, smallest_eigenvalue: float, fix: str):

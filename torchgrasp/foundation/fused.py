@@ -42,7 +42,7 @@ def has_numba() -> bool:
 
 @functools.cache
 def can_compile() -> bool:
-    """Return whether numba can be imported, and is new enough.
+    """Return whether numba can be imported, and is at least version 0.61 (`LEAST_NUMBA`).
 
     A numba that another package installed may be too old, or unable to work with the installed
     NumPy.
@@ -55,8 +55,8 @@ def can_compile() -> bool:
 
 
 def is_fused(*tensors: Tensor) -> bool:
-    """Return whether compiled loops are on and can compute with all of these tensors. They can if
-    every tensor is float64 on the CPU, needs no gradient, and is not inside torch.vmap.
+    """Return whether loops compiled by numba are on and can compute with all of these tensors. They
+    can if every tensor is float64 on the CPU, needs no gradient, and is not inside torch.vmap.
 
     Raises `MissingExtra` if the environment has TORCHGRASP_FUSED=1, but numba is not installed.
     Raises `BadArgument` for a value of TORCHGRASP_FUSED other than "0", "1" or none.
@@ -68,9 +68,11 @@ def is_fused(*tensors: Tensor) -> bool:
 
 
 def are_on() -> bool:
-    """Return whether compiled loops are on: TORCHGRASP_FUSED is "1", or it is unset and numba can
-    compile. Raises `MissingExtra` for "1" without numba, and `BadArgument` for values other than
-    "0" and "1".
+    """Return whether loops compiled by numba are on.
+
+    They are on if the environment variable TORCHGRASP_FUSED is "1". They are also on if it is unset
+    or empty, and numba can compile. Raises `MissingExtra` for "1" without numba, and `BadArgument`
+    for values other than "0", "1" or none.
     """
     asked = os.environ.get(VARIABLE, "")
     if asked not in {"", "0", "1"}:
@@ -98,8 +100,8 @@ def compiled(function: Any) -> Any:
 
 
 def inlined(function: Any) -> Any:
-    """Return a function for calls from `compiled` functions, into which numba inlines it. With
-    numba, Python itself cannot call it.
+    """Return a function that only `compiled` functions call, and into which numba inlines it. With
+    numba, Python itself cannot call it. Without numba, the function itself is returned.
     """
     # a call would find one of several copies, of other bits in a process that has just compiled
     options = dict(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
@@ -153,8 +155,8 @@ def _content(function: Any) -> bytes:
 
 
 def array(x: Tensor, dtype: torch.dtype = torch.float64) -> np.ndarray:
-    """Return a tensor on the CPU as a contiguous NumPy array, which shares the tensor's memory if
-    possible.
+    """Return the tensor `x`, which is on the CPU, as a contiguous NumPy array of the type `dtype`.
+    The array shares the tensor's memory if possible.
     """
     x = x.detach() if x.requires_grad else x
     return np.ascontiguousarray(x.to(dtype).numpy())

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def uncollected() -> Iterator[None]:
-    """Within the context, no cycles of garbage are collected.
+    """Return a context in which Python's cyclic garbage collector is off; afterwards it is as it
+    was before.
 
     Imports make many objects, and all of them stay. The collector would look at them again and
     again.

@@ -63,9 +63,10 @@ def run_as_they_end(
     """Run tasks in worker processes; yield the index and the result of each task as soon as it
     ends.
 
-    The result is that of `function(*task)`, or a `Status` if the task took too long or its process
-    died (`run_tasks`). `workers` is the number of processes, and `limit` [s] the longest CPU time of
-    a task.
+    The result is that of `function(*task)`. It is `Status.TIMED_OUT` if the task took too long, and
+    `Status.WORKER_DIED` if its process died twice. The error of a task is raised in place of its
+    result. `workers` is the number of processes; with 0 the tasks run in this process. `limit` [s]
+    is the longest CPU time of a task; ten times `limit` is the longest time by the clock.
     """
     with contextlib.closing(_run(function, tasks, workers, limit)) as results:
         for number, ended in results:

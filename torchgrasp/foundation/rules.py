@@ -26,7 +26,7 @@ from torchgrasp.foundation.limits import NAME_BYTES, PATH_BYTES, SHOWN_LETTERS
 class Range(NamedTuple):
     """A rule in an annotation: a number must lie in [`low`, `high`].
 
-    `words` describe the range in errors; without words the two bounds do.
+    `words` describe the range in errors; if they are empty, the two bounds do.
     """
 
     low: float
@@ -274,7 +274,7 @@ def show(value: Any) -> str:
 
 
 def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
-    """Return a mask of the matrices that are rigid transforms.
+    """Return a mask (*b,) of the matrices (*b, 4, 4) that are rigid transforms.
 
     Each has a right-handed rotation, up to rounding in float32, and the last row 0 0 0 1.
     """
@@ -319,8 +319,8 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
 
 
 def check_path(name: str, path: Path | str) -> None:
-    """Raise `BadArgument` for a path that no file can have: with a NUL, half a character (a lone
-    surrogate), or too many bytes.
+    """Raise `BadArgument` for a path that no file can have. It holds a NUL or half a character (a
+    lone surrogate), or is too long: over 4095 bytes, or 255 in one name.
 
     Errors call the path by `name`.
     """

@@ -21,7 +21,9 @@ them.
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread within the context; the number is restored afterwards."""
+    """Return a context in which torch computes with one thread. Afterwards it has as many threads
+    as before.
+    """
     if getattr(_here, "inside", False):
         yield
         return
@@ -59,8 +61,8 @@ def single_threaded(function: Function) -> Function:
 def each_within(
     items: Generator[Any, Any, Any], context: Callable[[], AbstractContextManager[None]]
 ) -> Iterator[Any]:
-    """Yield the items of a generator; each is computed within a new context, which ends before the
-    item is yielded.
+    """Yield the items of a generator; each item is computed within a new context, the result of
+    `context()`. The context ends before the item is yielded.
     """
     with contextlib.closing(items):
         while True:

@@ -6,7 +6,9 @@ from types import FrameType
 
 
 def warn_user(kind: type[Warning], sentence: str) -> None:
-    """Show a warning that names the line of the user's code that called the library."""
+    """Show a warning of the class `kind` with the text `sentence`. It names the line of the user's
+    code that called the library.
+    """
     frame: FrameType | None = sys._getframe()
     level = 0
     last = 0  # level of the outermost frame of the library

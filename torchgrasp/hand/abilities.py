@@ -173,7 +173,10 @@ class HandAbilities:
 
 @checked
 def hand_abilities(hand: Hand, postures: Count = 5000, seed: Seed = 0) -> HandAbilities:
-    """Return what a hand can do with its grasping fingers, measured in random postures.
+    """Return numbers on what a hand can do with its grasping fingers, measured in random postures.
+
+    They are the forces of its fingertips, the spans between them, and the widths that two of them
+    can hold.
 
     Args:
         hand: the hand, with its grasping fingers. The result is cached in `hand.derived`.
@@ -195,7 +198,9 @@ def hand_abilities(hand: Hand, postures: Count = 5000, seed: Seed = 0) -> HandAb
 
 
 def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
-    """Return n random postures of the h actuated joints [rad or m], uniform within their limits."""
+    """Return n random postures (n, h) [rad or m] of the h actuated joints, uniform within their
+    limits. `seed` is the random seed.
+    """
     share = torch.rand(
         n,
         hand.dof,

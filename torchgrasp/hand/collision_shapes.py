@@ -86,7 +86,9 @@ class CollisionSpheres(Value):
 def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
     """Return spheres that cover every collision shape of a hand's URDF.
 
-    `spec` is the content of hand.toml, which names the grasping fingers and their tips.
+    `spec` is the content of hand.toml, which names the grasping fingers and their tips. Spheres of
+    these tips do not protrude from the tip's faces; other spheres protrude by at most 4 mm
+    (`COVER.bulge`).
     """
     owner = {joint: i for i, f in enumerate(spec.fingers) for joint in f.joints}
     tips = [f.tip_link for f in spec.fingers]
@@ -106,11 +108,12 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
 
 
 def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], float]:
-    """Return the centres [m] of spheres that cover a shape, in the frame of its link, then their
-    one radius [m].
+    """Return the centres [m] of spheres that cover a collision shape, then the radius [m] that all
+    of them have.
 
-    There is one sphere for each cell of about the edge `cell` [m]. Each sphere is moved inward
-    until it extends beyond a face by at most `bulge` [m].
+    The centres are in the frame of the shape's link. The shape is cut into cells of about the edge
+    `cell` [m], with a sphere for each outer cell. Each sphere is moved inward until it protrudes
+    from a face by at most `bulge` [m]. A shape that is a sphere is its own cover.
     """
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]
@@ -143,8 +146,9 @@ def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], fl
 def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
     """Return the collision shapes of a URDF's links, and the pairs of shapes to test for collision.
 
-    `pairs` names the pairs of links to test; None means all but a link and its parent. Raises
-    `HandFileError` for more than 20,000 pairs of shapes.
+    `pairs` has the names of the two links of each pair to test; None means all pairs but a link and
+    its parent. Shapes are boxes and spheres: a cylinder becomes six boxes. Raises `HandFileError`
+    for more than 20,000 pairs of shapes.
     """
     names = [x.name for x in urdf.links]
     listed = itertools.combinations(names, 2) if pairs is None else pairs
@@ -220,13 +224,14 @@ def _parts(shape: LinkShape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple,
 def collision_pairs(
     urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0
 ) -> list[tuple[str, str]]:
-    """Return the names of the pairs of links that can collide, found in n random postures drawn
-    from `seed`.
+    """Return the names of the two links of each pair that can collide, found in n random postures
+    drawn from `seed`.
 
     The two links come nearer than 2 mm (`MEETING_DISTANCE`) in some posture. They overlap in at
-    most 98 % of the postures (`ALWAYS`). A link and its parent are never a pair. `coupling` gives
-    the coupled joints by name. Raises `BadArgument` for unknown joints, or an `n` outside [1,
-    10^7]. Raises `HandFileError` if too many shapes are near each other.
+    most 98 % of the postures (`ALWAYS`): links that always overlap do so by construction. A link
+    and its parent are never a pair. `coupling` tells by name which joints follow others, and how.
+    Raises `BadArgument` for unknown joints, or an `n` outside [1, 10^7]. Raises `HandFileError` if
+    too many shapes are near each other.
     """
     check_whole("n", n, 1, MOST_POSTURES)
     tree = tree_from_urdf(urdf)
@@ -266,7 +271,7 @@ def collision_pairs(
 def met_pairs(
     urdf: Urdf, pairs: Sequence[tuple[str, str]], postures: Float[Tensor, "j n"]
 ) -> Bool[Tensor, "p n"]:
-    """Return whether the links of each of p pairs overlap in each of n postures.
+    """Return a mask (p, n): whether the two links of each of p pairs overlap in each of n postures.
 
     `pairs` holds the names of the two links of each pair. `postures` (j, n) are positions [rad or
     m] of all j movable joints, in the order of the URDF.
@@ -305,11 +310,11 @@ def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Frames, ahead: int, m
 def draw_postures(
     urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int
 ) -> Float[Tensor, "j n"]:
-    """Return n random positions [rad or m] of all j movable joints, uniform within the limits;
-    coupled joints follow.
+    """Return n random postures (j, n) [rad or m] of all j movable joints of a URDF, in its order.
+    Independent joints are uniform within their limits, and coupled joints follow them.
 
-    `coupling` gives the coupled joints by name. Raises `BadArgument` if it names a joint that the
-    URDF lacks.
+    `coupling` tells by name which joints follow others, and how. `seed` is the random seed. Raises
+    `BadArgument` if `coupling` names a joint that the URDF lacks.
     """
     movable = {j.name: j for j in urdf.movable}
     named = {*coupling} | {name for mimic in coupling.values() for name, _ in mimic.terms}

@@ -8,7 +8,8 @@ from torchgrasp.hand.hand import Actuator, Hand
 
 
 def stiff_drives(hand: Hand, kp: float | None) -> dict[str, Actuator]:
-    """Return the drive of each movable joint by its name.
+    """Return the drive of each movable joint of the URDF by the joint's name, with the stiffness
+    `kp`.
 
     `kp` [N m/rad, or N/m for sliding joints] replaces the stiffness of all drives. None keeps the
     hand's own.
@@ -40,21 +41,23 @@ def drive_efforts(hand: Hand) -> Float[Tensor, " j"]:
 
 
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each of h actuated joints, together with the joints coupled
-    to it.
+    """Return the stiffness (h,) [N m/rad] of each of h actuated joints, together with the joints
+    coupled to it.
 
-    `kp` [N m/rad] replaces the stiffness of every drive; None means the hand's own. For sliding
-    joints units are [N/m].
+    It is the sum of the stiffnesses of their drives, each times its squared coupling ratio. `kp` [N
+    m/rad] replaces the stiffness of every drive; None means the hand's own. For sliding joints
+    units are [N/m].
     """
     return coupled_stiffness(hand, drive_stiffness(hand, kp))
 
 
 def coupled_stiffness(hand: Hand, drives: Float[Tensor, " j"]) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each of h actuated joints, together with the joints coupled
-    to it.
+    """Return the stiffness (h,) [N m/rad] of each of h actuated joints, together with the joints
+    coupled to it.
 
-    `drives` [N m/rad] are the stiffnesses of the drives of all j movable joints of the URDF. For
-    sliding joints units are [N/m].
+    `drives` (j,) [N m/rad] are the stiffnesses of the drives of all j movable joints of the URDF.
+    The result is the sum of those that move with the actuated joint, each times its squared
+    coupling ratio. For sliding joints units are [N/m].
     """
     coupling = hand.actuated.coupling
     return (coupling**2 * drives.to(coupling)[:, None]).sum(0)

@@ -138,11 +138,12 @@ class ActuatedJoints(Value):
 
 
 def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
-    """Return the actuated joints: those of the grasping fingers, and the joints that their coupled
-    joints follow.
+    """Return the actuated joints of a hand with their limits and coupling.
 
-    `spec` is the content of hand.toml. Raises `HandFileError` if its limit margin leaves an empty
-    range. Raises it also if an option of hand.toml gives no position to a joint that does not
+    They are the joints of the grasping fingers that follow no other joint. Joints that their
+    coupled joints follow are actuated, too. `spec` is the content of hand.toml. Its limit margin is
+    taken off both ends of each range. Raises `HandFileError` if the margin leaves an empty range.
+    Raises it also if the chosen option of hand.toml gives no position to a joint that does not
     grasp.
     """
     movable = {j.name: j for j in urdf.movable}
@@ -221,7 +222,7 @@ class Fingertips(Value):
     @kept
     def cone(self) -> Float[Tensor, "f"]:
         """Half angle (f,) [rad] of the cone about each pad's normal in which the pad may touch a
-        surface. A cached property.
+        surface: 60 degrees for a sphere, 40 degrees for a point. A cached property.
         """
         # float32, as when results were published
         angles = self.radius.new_tensor([ROUND_PAD, FLAT_PAD], dtype=torch.float32)
@@ -263,7 +264,8 @@ class Fingertips(Value):
 
 
 def tips_from_files(spec: HandSpec, urdf: Urdf, chain: Any) -> Fingertips:
-    """Return the fingertips of the grasping fingers.
+    """Return the fingertips of the grasping fingers, with their pads and their place in the
+    kinematic tree.
 
     `spec` is the content of hand.toml, and `chain` the pytorch-kinematics chain of the URDF.
     """

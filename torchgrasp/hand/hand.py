@@ -146,8 +146,8 @@ class Hand(Value):
 
     @kept
     def motion(self) -> FreeMotion:
-        """Tables of how collision spheres, fingertips and pad normals move with the hand's pose and
-        joints.
+        """Matrices that tell how collision spheres, fingertips and pad normals move in a small step
+        of the hand's pose and joints.
 
         It is a cached property that only inverse kinematics uses, as in `solve_ik`. Its class
         `FreeMotion` is not public.
@@ -161,7 +161,9 @@ class Hand(Value):
 
     @property
     def derived(self) -> dict[Any, Any]:
-        """A cache of values that torchgrasp computes from the hand, such as `hand_abilities`."""
+        """A dict in which torchgrasp caches what it computes from the hand, such as the result of
+        `hand_abilities`.
+        """
         self._check_unchanged()
         return self._derived
 
@@ -219,7 +221,7 @@ class Hand(Value):
 
     @checked
     def require_three(self, argument: str, what: str) -> None:
-        """Raise `BadArgument` unless the hand has exactly three fingertips.
+        """Raise `BadArgument` unless the hand has exactly three grasping fingers.
 
         Functions call it for options that exist for three fingertips only.
 

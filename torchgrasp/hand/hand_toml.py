@@ -69,7 +69,7 @@ class Option(NamedTuple):
     """A choice of grasping fingers that hand.toml offers under a name (an option)."""
 
     fingers: Grasping  # the grasping fingers
-    # positions [rad or m], by name, of the joints that stay fixed meanwhile
+    # positions [rad or m], by name, of joints that stay fixed while these fingers grasp
     parked: dict[str, float]
 
 
@@ -114,18 +114,18 @@ class HandSpec:
     data: bytes
 
     def wrong(self, found: str, allowed: str) -> HandFileError:
-        """Return the error to raise if hand.toml has what the text `found` says in place of
-        `allowed`.
+        """Return an error for a fault of this hand.toml. The text `found` says what the file has,
+        and `allowed` what is expected.
         """
         return HandFileError("hand.toml", f"{self.path}: {found}", allowed)
 
 
 def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
-    """Read and check a hand.toml, with the chosen grasping `fingers`.
+    """Read and check a hand.toml; return its content, with the chosen grasping `fingers`.
 
-    `fingers` are the name of an option of hand.toml, a number of fingers, or names of fingers.
-    Raises `HandFileError` for a missing or malformed file, and `BadArgument` for fingers that the
-    hand lacks.
+    `fingers` are the name of an option of hand.toml, a number of fingers, or names of fingers. A
+    number takes the first option with as many. Raises `HandFileError` for a missing or malformed
+    file, and `BadArgument` for fingers that the hand lacks.
     """
     path = Path(path)
     refuse = functools.partial(HandFileError, "hand.toml")
@@ -317,9 +317,9 @@ def _coupling(field: Field) -> dict[str, Mimic]:
 
 
 def leading(coupling: Mapping[str, Mimic], joints: Collection[str]) -> set[str]:
-    """Return the names of the joints that the coupled joints among `joints` follow.
+    """Return the names of the joints that are followed by coupled joints among `joints`.
 
-    `joints` holds names, and `coupling` gives the coupled joints by name.
+    `joints` holds names of joints. `coupling` tells by name which joints follow others, and how.
     """
     return {name for joint in joints if joint in coupling for name, _ in coupling[joint].terms}
 

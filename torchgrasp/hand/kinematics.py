@@ -152,14 +152,17 @@ class KinematicTree(Value):
 
 @dataclasses.dataclass(frozen=True)
 class FreeMotion(Value):
-    """Tables of how the links of a free-floating hand, and marker points on them, move in a small
-    step.
+    """Matrices that tell how links of a free-floating hand, and markers on them, move in a small
+    step of its pose and joints.
 
-    The hand has q motions. They are three translations along the root's axes, three rotations about
-    them, and those of the moved joints. A step has d = 6 + h numbers: for the pose, and for the h
-    actuated joints. A marker is a point or a direction on a link. Markers come in groups. First
-    come the given groups, then the origins of all motions, all rotation axes, and all translation
-    axes. One of the two axes of a motion is zero.
+    A step has d = 6 + h numbers: 6 for the root link's pose, and h for the actuated joints. It
+    gives the hand q motions, each a translation or a rotation. They are three translations along
+    the root's axes, and three rotations about them. Then comes the motion of each joint that an
+    actuated joint moves.
+
+    A marker is a point or a direction that is fixed to a link. Markers come in groups. First come
+    the given groups. Then come the origins, the rotation axes and the translation axes of all
+    motions, three groups of q markers. One of the two axes of a motion is zero.
     """
 
     # matrix that maps the k = 4 l numbers of one coordinate of the frames of the l links to that of
@@ -177,11 +180,13 @@ class FreeMotion(Value):
         coupling: Float[Tensor, "j h"],
         markers: Sequence[tuple[Int[Tensor, "_"], Float[Tensor, "_ 3"], float]],
     ) -> "FreeMotion":
-        """Return the tables for groups of markers.
+        """Return the matrices for the hand with the kinematic `tree`, and for given groups of
+        markers.
 
-        A group has link indices, and coordinates [m] in the frames of these links. Its number is 1
-        for points, and 0 for directions. `coupling` (j, h) is the motion of each movable joint for
-        a unit motion of each actuated joint (`ActuatedJoints.coupling`).
+        `markers` has (links, coordinates, number) for each group. They are the indices of the
+        markers' links in `tree.link_names`, and the markers' coordinates in the frames of these
+        links. The number is 1 for points [m], and 0 for directions. `coupling` (j, h) is the motion
+        of each movable joint for a unit motion of each actuated joint.
         """
         own = flatnonzero((coupling != 0).any(1))
         eye = functools.partial(torch.eye, dtype=tree.axis.dtype, device=tree.axis.device)
@@ -213,10 +218,11 @@ class FreeMotion(Value):
         return cls(product.flatten(1), tuple(map(len, local)), moves, whole)
 
     def place(self, frames: Frames) -> tuple[Float[Tensor, "3 p n"], ...]:
-        """Return the coordinates [m] of each group of markers in the root's frame, given the frames
-        of all links.
+        """Return the coordinates (3, p, n) of each group of p markers in n postures.
 
-        Directions are unit vectors; p is the size of a group.
+        `frames` (3, 4, l, n) are the poses [m] of all l links, from `KinematicTree.frames`. The
+        result is in the same frame as they are, such as that of the root link. Points are in [m];
+        directions keep their lengths.
         """
         product = self.product.to(frames).expand(3, -1, -1)
         return torch.bmm(product, frames.flatten(1, 2)).split(self.sizes, 1)
@@ -225,10 +231,11 @@ class FreeMotion(Value):
 def map_points(
     frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "3 p n"]:
-    """Return p points [m] in the root's frame, in n postures.
+    """Return the coordinates (3, p, n) [m] of p points on links, in the root's frame and n
+    postures.
 
-    `frames` holds the pose (3 x 4) [m] of each point's link in the root's frame. `local` [m] holds
-    the points in the frames of their links.
+    `frames` (3, 4, p, n) holds the pose (3 x 4) [m] of each point's link in the root's frame.
+    `local` (p, 3) [m] holds the points in the frames of their links.
     """
     return map_directions(frames, local) + frames[:, 3]
 
@@ -236,10 +243,11 @@ def map_points(
 def map_directions(
     frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "3 p n"]:
-    """Return p directions in the root's frame, in n postures and in the unit of `local`.
+    """Return the components (3, p, n) of p directions on links, in the root's frame and n postures.
+    Their lengths and unit are those of `local`.
 
-    `frames` holds the pose (3 x 4) [m] of each direction's link in the root's frame. `local` holds
-    the directions in the frames of their links.
+    `frames` (3, 4, p, n) holds the pose (3 x 4) [m] of each direction's link in the root's frame.
+    `local` (p, 3) holds the directions in the frames of their links.
     """
     x, y, z = local.to(frames)[:, :, None].unbind(1)
     mapped = torch.addcmul(frames[:, 0] * x, frames[:, 1], y)
@@ -273,7 +281,8 @@ def tree_from_urdf(
     """Return the kinematic tree of a URDF, with links in the order of the URDF.
 
     `chain` is the URDF as a pytorch-kinematics chain; None means that it is made here. `ends` holds
-    names of links: the result is then the part of the tree that leads to them. None means all.
+    names of links: the result is then the part of the tree that leads from the root to these links.
+    None means the whole tree.
     """
     model: Any = chain or chain_from_urdf(urdf)  # it declares no types
     index = model.frame_to_idx
@@ -315,8 +324,8 @@ def tree_from_urdf(
 def chain_poses(
     chain: "pytorch_kinematics.chain.Chain", names: Sequence[str], values: Float[Tensor, "j n"]
 ) -> Float[Tensor, "c n 4 4"]:
-    """Return the poses (c, n, 4, 4) [m] of a chain's c frames in the root's frame, by
-    pytorch-kinematics.
+    """Return the poses (c, n, 4, 4) [m] of a chain's c links in the root's frame, computed by
+    pytorch-kinematics. The links are in the order of the chain.
 
     `values` (j, n) [rad or m] holds n postures of all j movable joints, in the order of `names`.
     Raises `BadArgument` inside torch.vmap.
@@ -335,9 +344,11 @@ def chain_poses(
 def pose_in_carrier(
     chain: "pytorch_kinematics.chain.Chain", link: str
 ) -> tuple[str, Float[Tensor, "3 4"]]:
-    """Return the name of a link's carrier, then the pose (3 x 4) [m] of the link in it.
+    """Return the name of a link's carrier, then the pose (3, 4) [m] of the link in the carrier's
+    frame.
 
-    The carrier is the nearest link, the link itself or one above, that a joint moves.
+    The last row of the 4 x 4 matrix is left out. The carrier is the nearest link, the link itself
+    or one above, that a joint moves directly. If no joint moves any of them, it is the root link.
     """
     *above, carrier = chain.parents_indices[chain.frame_to_idx[link]].tolist()
     pose = _tables(chain, 0)[0]

@@ -147,7 +147,7 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
 def check_as_loaded(hand: Hand) -> None:
     """Raise `BadArgument` for a hand with other numbers than its files, such as narrower limits.
 
-    Functions call it that read the files again, and would not use such numbers.
+    Functions that read the hand's files again call it, because they would not use such numbers.
     """
     loaded = load_hand(hand.urdf_path.parent, hand.source.option)
     ours = named_tensors(hand.to("cpu", torch.float64))

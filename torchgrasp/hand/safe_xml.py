@@ -103,12 +103,12 @@ def bounded_tree(data: bytes | str) -> ET.Element:
 
 
 def parse_urdf(path: Path, data: bytes, visual: bool = False) -> ET.Element:
-    """Return the XML tree of a URDF with only links and joints, and with checked numbers.
+    """Return the XML tree of a URDF, reduced to links and joints with checked numbers.
 
-    `data` are the bytes of the file; `path` is named in errors. With `visual`, a link without
-    <collision> has its <visual> in its place. Known elements of other kinds (`IGNORED`), such as
-    <transmission>, are left out. Raises `HandFileError` for malformed XML, for unknown elements,
-    and for numbers that are missing or not finite.
+    `data` are the bytes of the file; `path` is only named in errors. With `visual`, the <visual> of
+    a link without <collision> becomes its <collision>. Known elements of other kinds (`IGNORED`),
+    such as <transmission>, are left out. Raises `HandFileError` for malformed XML, for unknown
+    elements, and for numbers that are missing or not finite.
     """
     # also within comments: a declaration may be hidden by a processing instruction that looks like
     # a comment
@@ -153,7 +153,7 @@ def parse_urdf(path: Path, data: bytes, visual: bool = False) -> ET.Element:
 
 
 def seen_links(data: bytes) -> tuple[str, ...]:
-    """Return the names of the links with a <visual> but no <collision>.
+    """Return the names of the links of a URDF that have a <visual> but no <collision>.
 
     `data` are the bytes of a URDF that `parse_urdf` has accepted.
     """
@@ -162,10 +162,11 @@ def seen_links(data: bytes) -> tuple[str, ...]:
 
 
 def soft_limits(data: bytes) -> dict[str, tuple[float, float]]:
-    """Return the soft limits (lower, upper) [rad or m] of joints by the joint's name.
+    """Return the soft limits (lower, upper) [rad or m] of joints by the joint's name, from their
+    elements <safety_controller>.
 
-    Joints whose <safety_controller> lacks one of the two are left out. `data` are the bytes of a
-    URDF that `parse_urdf` has accepted.
+    A joint without this element, or without both limits in it, is left out. `data` are the bytes of
+    a URDF that `parse_urdf` has accepted.
     """
     robot = bounded_tree(data)
     found = {}

@@ -197,13 +197,15 @@ class SelfCollision(Value):
 
     @checked
     def only(self, kept: Bool[Tensor, " p"]) -> "SelfCollision":
-        """Return the same shapes with fewer pairs: those that the mask `kept` (p,) selects."""
+        """Return a copy with the same shapes, but only with the pairs of shapes that the mask
+        `kept` (p,) selects.
+        """
         one, two, three = (int(kind.sum()) for kind in kept.split(self.kinds))
         return dataclasses.replace(self, pairs=self.pairs[kept], kinds=(one, two, three))
 
     def link_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of links that are tested, as pairs of indices in `Hand.tree.link_names`,
-        sorted.
+        """Return the pairs of links that are tested for collision, each once and sorted. A pair
+        holds two indices in `Hand.tree.link_names`.
         """
         links = self.link[self.pairs].sort(1).values
         return [(one, two) for one, two in torch.unique(links, dim=0).tolist()]
@@ -357,11 +359,11 @@ class BoxPairs(NamedTuple):
     half_b: Float[Tensor, "3 k"]  # half sizes [m] of box b along its axes
 
     def along_axes(self) -> Float[Tensor, "15 k"]:
-        """Return the separations [m] along the 15 candidate axes of two boxes (Gottschalk et al.,
-        1996).
+        """Return the separations (15, k) [m] of each pair of boxes along 15 candidate axes.
 
-        The three axes of box a come first, then those of b, then the nine cross products. The
-        largest separation is a lower bound of the distance. A negative one is minus the shortest
+        One of these axes separates the boxes if any does (Gottschalk et al., 1996). The three axes
+        of box a come first, then those of b, then the nine cross products. The largest separation
+        of a pair is a lower bound of the distance. If it is negative, it is minus the shortest
         translation that separates the boxes.
         """
         a, b, gap, half_a, half_b = self
@@ -384,11 +386,12 @@ class BoxPairs(NamedTuple):
         return torch.cat([by_a, by_b, by_edges])
 
     def push(self, best: Int[Tensor, " c"]) -> Pushed:
-        """Return two vectors of each pair: the unit vector of axis `best` towards box b, then the
-        contact point [m].
+        """Return (directions, points) of c = k pairs, both (3, c): where box b is pushed out of box
+        a, and where they touch.
 
-        The contact point is relative to the centre of box b. `best` is the index of one of the 15
-        axes of `along_axes` for each pair (c = k).
+        `best` (c,) is the index of one of the 15 axes of `along_axes` for each pair. The direction
+        is the unit vector of this axis that points towards box b. The contact point [m] is relative
+        to the centre of box b.
         """
         a, b, gap, half_a, half_b = self
         best = best[None]
@@ -417,9 +420,11 @@ class BoxPairs(NamedTuple):
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the signed distance [m] of `points` [m] from boxes around the origin, negative inside.
+    """Return the signed distance (*b,) [m] of each point from a box around the origin, negative
+    inside.
 
-    `half` [m] holds the half sizes of each box along x, y and z.
+    `points` (*b, 3) [m] are in the frames of their boxes. `half` (*b, 3) [m] holds the half sizes
+    of each point's box along x, y and z.
     """
     ox, oy, oz = (points.abs() - half).unbind(-1)
     px = ox.clamp_min(0)

@@ -47,7 +47,7 @@ class Mimic(NamedTuple):
 
     @property
     def terms(self) -> tuple[tuple[str, float], ...]:
-        """Names of all joints that this joint follows, each with its ratio."""
+        """Pairs (name, ratio) of all joints that this joint follows: `source` and `others`."""
         return (self.source, self.ratio), *self.others
 
     def follow(self, positions: Mapping[str, Any]) -> Any:
@@ -75,7 +75,9 @@ class LinkShape:
 
     @property
     def half(self) -> Triple:
-        """Half sizes (x, y, z) [m] of the box around a box, sphere or cylinder."""
+        """Half sizes (x, y, z) [m], along the shape's own axes, of the smallest box around it. It
+        is not defined for a mesh.
+        """
         if self.kind == "box":
             return self.size[0] / 2, self.size[1] / 2, self.size[2] / 2
         return (
@@ -140,8 +142,8 @@ class Urdf:
 
     @checked
     def wrong(self, found: str, allowed: str) -> HandFileError:
-        """Return the error to raise if the URDF has what the text `found` says in place of
-        `allowed`.
+        """Return an error for a fault of this URDF. The text `found` says what the file has, and
+        `allowed` what is expected.
         """
         return HandFileError("urdf", f"{self.path}: {found}", allowed)
 
@@ -179,13 +181,15 @@ class Urdf:
 
 
 def pose_of(part: Joint | LinkShape) -> Float[np.ndarray, "4 4"]:
-    """Return the pose (4, 4) [m] of a joint or a shape in the frame of its parent link."""
+    """Return the pose (4, 4) [m] of a joint, in its parent link's frame and at position zero. For a
+    shape it is the pose in the frame of its link.
+    """
     return rigid(rotation_from_rpy(part.rpy), real(part.xyz)).numpy()
 
 
 @checked
 def read_urdf(path: Path | str) -> Urdf:
-    """Read a URDF that the library can use as it is.
+    """Read a URDF that the library can use as it is; return its links, joints and collision shapes.
 
     Raises `HandFileError` for a missing or malformed file. Raises it also for collision meshes,
     joints without limits, and coupled joints that follow a coupled joint.
@@ -221,7 +225,7 @@ def read_published(path: Path | str, visual: bool = False) -> Urdf:
 
 
 def read_visuals(path: Path, data: bytes) -> dict[str, tuple[LinkShape, ...]]:
-    """Return the visual shapes (<visual>) of each link by its name.
+    """Return the visual shapes (<visual>) of each link of a URDF, by the link's name.
 
     `data` are the bytes of a URDF that `read_urdf` or `read_published` has accepted, and `path` is
     named in errors. Only pictures use these shapes: the dict is empty if any is malformed.

@@ -258,11 +258,11 @@ NO_OPTIONS = ClosingOptions(wait=False, pose_estimate=False, palm_reach=0.0, sto
 
 
 def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptions:
-    """Return the options of the closing mode `closing`.
+    """Return the options with which a hand closes in the mode `closing` (`TrialSpec.closing`).
 
-    In the modes "uncertainty" and "fixed" these are the given `options`, or `ClosingOptions()` for
-    None. In other modes all options are off (`NO_OPTIONS`). Raises `BadArgument` for other modes if
-    `options` is not None.
+    In the modes "uncertainty" and "fixed" they are the argument `options`, or `ClosingOptions()`
+    for None. In other modes all options are off (`NO_OPTIONS`). In these modes `options` other than
+    None raise `BadArgument`.
     """
     if closing in ("uncertainty", "fixed"):
         return ClosingOptions() if options is None else options

@@ -148,14 +148,14 @@ class Distribution(Value):
 
     @functools.cached_property
     def shares(self) -> tuple[float, ...]:
-        """The probability of each part, in the order of `parts`; their sum is 1."""
+        """The probability of each interval in `parts`, in this order; their sum is 1."""
         weights = self.weights or (1.0,) * len(self.parts)
         total = math.fsum(weights)
         return tuple(x / total for x in weights)
 
     @property
     def simplest(self) -> "float | Distribution":
-        """The number as a float if only one is possible, else this `Distribution`."""
+        """The number as a float if only one number is possible, else this `Distribution`."""
         return self.least if self.least == self.most else self
 
     @property
@@ -327,8 +327,8 @@ class Distribution(Value):
 
         A part that is a single number is one node. An interval is cut into equal pieces, and their
         middles are the nodes. The greater an interval's probability, the more pieces it has. If the
-        distribution has more `parts` than `count`, the nodes are the `count` quantiles (i + 1/2) /
-        `count`, each with the probability 1 / `count`.
+        distribution has more `parts` than `count`, the nodes are `count` quantiles. Their levels
+        are (i + 1/2) / `count` for i = 0 to `count` - 1. Each has the probability 1 / `count`.
 
         Raises `BadArgument` for a `count` out of range.
 
@@ -350,9 +350,9 @@ class Distribution(Value):
 
 
 def check_within(name: str, value: float | Distribution, allowed: Range) -> None:
-    """Raise `BadArgument` for a distribution of numbers outside the range `allowed`.
+    """Raise `BadArgument` if `value` is a distribution with numbers outside the range `allowed`.
 
-    Errors call the distribution by `name`.
+    A plain number is not checked. Errors call the distribution by `name`.
     """
     if (
         isinstance(value, Distribution)

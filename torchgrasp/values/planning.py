@@ -436,8 +436,8 @@ class Grasps(Batch):
         """The predicted probability (g,) that each planned grasp holds the object in its task, the
         argument `task` of `plan_grasps`.
 
-        It is 0 for a grasp that cannot be executed, and NaN if it is not `known`. The success of a
-        single grasp formats as a number: `f"{grasps.best.success:.0%}"`.
+        It is 0 for a grasp that failed a check, and NaN for an executable one that is not `known`.
+        The success of a single grasp formats as a number: `f"{grasps.best.success:.0%}"`.
         """
         likely = torch.sigmoid(self.score)
         likely = likely if self.known is None else torch.where(self.known, likely, torch.nan)
@@ -450,8 +450,7 @@ class Grasps(Batch):
 
     @property
     def best(self) -> "Grasps":
-        """The first executable grasp, one that passed all checks, as a batch of one, which all
-        functions take.
+        """The first executable grasp as a batch of one grasp. Executable grasps passed all checks.
 
         `best.joints[0]` are its joints [rad or m], without the axis of the batch.
         `float(best.success)` is a number. Raises `FailedRows` with the reasons if there is no
@@ -475,7 +474,7 @@ class Grasps(Batch):
     def table(self) -> Plane | None:
         """The table that the planner was given, in the frame of the planned cloud.
 
-        None if the grasps were planned without a table, or if `meta` does not say.
+        None if the grasps were planned without a table, or if `meta` has no entry "table".
         """
         return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 
@@ -483,9 +482,9 @@ class Grasps(Batch):
         """Return a sheet for notebooks: a table of up to five executable grasps, and a picture of
         the first.
 
-        Executable grasps passed all checks. A notebook shows both, and `print` shows the table. The
-        attribute `picture` of the sheet holds the picture as PNG; it is None if no grasp is
-        executable.
+        Executable grasps passed all checks. A notebook shows table and picture, and `print` shows
+        the table. The attribute `picture` of the sheet holds the picture as PNG; it is None if no
+        grasp is executable.
 
         Args:
             cloud: the cloud of the object, in any form that `plan_grasps` takes. With it the
@@ -520,7 +519,7 @@ def _pages() -> Any:
 def format_success(success: "Grasps | float") -> str:
     """Return a predicted success as a percentage, or "unknown" for NaN.
 
-    `success` is a probability, or grasps, of which the first counts.
+    `success` is a probability in [0, 1], or `Grasps`, whose first grasp counts.
     """
     number = float(success.success[0]) if isinstance(success, Grasps) else success
     return "unknown" if number != number else f"{number:.0%}"

@@ -114,7 +114,7 @@ class ContactSpec(Value):
 
     @checked
     def updated(self, result: ClosureResult) -> "ContactSpec":
-        """Return this spec with the `friction` that a closing has measured
+        """Return this spec with the friction coefficient that a closing has measured
         (`ClosureResult.friction`), to plan the next grasp.
 
         `result` is what `close_hand` returned. If its `friction` is None, the spec is returned as
@@ -126,9 +126,10 @@ class ContactSpec(Value):
 
     @property
     def planned_friction(self) -> float:
-        """The mean friction times `friction_margin`, a coefficient without unit.
+        """The friction coefficient (no unit) with which contacts are planned, and checked for force
+        closure (`certify`).
 
-        Contacts are planned, and checked for force closure (`certify`), with it.
+        It is the mean friction at execution times `friction_margin`.
         """
         return self.mean_friction * self.friction_margin
 
@@ -163,13 +164,14 @@ class ContactSpec(Value):
 
     @property
     def least_height(self) -> float:
-        """The least height [m] of an object that fingertips on the table can grasp.
+        """The least height [m] of an object on the table that fingertips can grasp while they rest
+        on the table.
 
         Fingertips are balls of radius r, the `fingertip_radius`. With a `flat_radius` they must
         touch a flat side, and the least height is r + `flat_radius`. With None they may touch the
         object's rounded upper rim, and the least height is (r + q)(1 - s). Here q is the rim's
-        radius, 3 mm, the least of `FLAT_RADII`. The number s is the largest vertical part of the
-        contact's unit normal that `mean_friction` allows.
+        radius, 3 mm, the least of `FLAT_RADII`. The number s is the largest vertical component of
+        the contact's unit normal that `mean_friction` allows.
         """
         if self.flat_radius is not None:
             return self.fingertip_radius + self.flat_radius
@@ -197,15 +199,16 @@ class ContactSpec(Value):
 
     @checked
     def relaxed(self, below: Length, radius: Length) -> "Iterator[ContactSpec]":
-        """Yield weaker constraints for an object for which no grasp was found, the strictest first.
+        """Yield specs with weaker constraints, for an object for which no grasp was found. The
+        strictest spec comes first.
 
-        First come specs with a smaller `flat_radius`. They are 8, 6, 4 and 3 mm (`FLAT_RADII`), as
-        far as they are less than `below`.
+        First come specs with a smaller `flat_radius`: those of 8, 6, 4 and 3 mm (`FLAT_RADII`) that
+        are less than `below`.
 
-        With a table, three specs follow for the upper rim of a low object. They have a
-        `flat_radius` of 1 mm (`RIM`). There a fingertip on the table touches an inclined surface.
-        The estimated rim is too round, so its normals are too steep. Therefore the second spec
-        reduces two margins by half, and the third spec drops them. The first margin is that of the
+        With a table, three specs with a `flat_radius` of 1 mm (`RIM`) follow. They are for a low
+        object, whose inclined upper rim is touched by fingertips that rest on the table. The
+        estimated rim is too round, so its normals are too steep. Therefore the second spec reduces
+        two margins by half, and the third spec drops them. The first margin is that of the
         friction: `planned_friction` rises to `mean_friction`. The second is that of a `tip_radius`
         of None: it falls from at least 12 mm (`TIP_RADIUS`) to `radius`.
 
@@ -470,8 +473,14 @@ def default_holding(sensor: SensorModel, closing: ClosingMode) -> HoldingMode:
 
 
 def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
-    """Raise `BadArgument` if closing and holding mode do not combine, or need more than the sensor
-    measures.
+    """Raise `BadArgument` if a closing and a holding mode do not combine, or need more than the
+    sensor measures.
+
+    The modes are those of `TrialSpec`. The holding "law" needs the closing "uncertainty", "fixed"
+    or "paper". After the closing "open_loop" neither "grip" nor "impedance" is possible.
+
+    Some modes need a tactile sensor at all fingers, with none dead. They are the closings
+    "position", "paper_position" and "paper", and the holdings "grip", "impedance" and "law".
     """
     if holding == "law" and closing not in ("fixed", "uncertainty", "paper"):
         raise BadArgument(
@@ -492,8 +501,11 @@ def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
 
 def check_limit(max_force: float | None, closing: str, holding: str) -> None:
     """Raise `BadArgument` if `max_force` [N] is given, but the modes `closing` and `holding` do not
-    keep the forces below it. The springs of the holding "impedance" add to its forces. Modes that
-    command positions alone bound no force.
+    keep the fingertip forces below it.
+
+    The holding "impedance" does not, because its springs add to the forces. Nor does the holding
+    "position" after the closing "position" or "paper_position": it commands positions alone. A
+    `max_force` of None is always accepted, and so is any after the closing "open_loop".
     """
     if max_force is None or closing == "open_loop":
         return
