@@ -72,8 +72,8 @@ def convex_parts(
 
     Raises:
         MeshError: the mesh is missing, open or without volume.
-        MeshError: the coarsest cut takes more than 4 GiB of memory, or more than 60 s of processor
-            time plus 5 ms a face.
+        MeshError: the coarsest cut takes more than 4 GiB of memory, or 60 s of processor time plus
+            5 ms a face.
         MissingExtra: the mesh is not convex, and CoACD is not installed.
 
     >>> import trimesh
