@@ -290,8 +290,8 @@ def map_rows(
 ) -> Tensor:
     """Return the values of a function at all points `x` (*b, d), computed in float64 in chunks.
 
-    `function` maps points (n, d) to a tensor whose first axis is n. In the result the batch axes
-    *b of `x` replace this axis, and the dtype is that of `x`.
+    `function` maps points (n, d) to a tensor whose first axis counts the points. In the result the
+    batch axes of `x` replace this axis, and the dtype is that of `x`.
     """
     chunks = x.reshape(-1, x.shape[-1]).double().split(ROWS_PER_CHUNK)
     y = torch.cat([function(rows) for rows in chunks])

@@ -144,14 +144,15 @@ def growing_bic(
     """Return the Bayesian information criterion (BIC) of mixtures of 1 to `most` Gaussians, fitted
     to `samples` (Fig. 6 b, d of the paper).
 
-    Each fit starts from the one before. Its heaviest Gaussian, that of the greatest weight, is
-    split across its longest axis, and EM continues. The fits take
-    no random number. The criterion belongs to the given postures: more postures support more
-    Gaussians. Codes of "uniform" samples are exact functions of the joints, so the BIC falls
-    without end. For "grasping" samples, whose fingertips roll, the BIC has a minimum. The
-    `observer` is called with each number of Gaussians. Raises `BadArgument` for too few samples,
-    codes not of three fingers, or a joint that does not vary. Raises `IndefiniteCovariance` if a
-    Gaussian collapses more than three times.
+    Each fit starts from the one before. The Gaussian of the greatest weight is split across its
+    longest axis, and EM continues. The fits take no random number. The criterion belongs to the
+    given postures: more postures support more Gaussians. Codes of "uniform" samples are exact
+    functions of the joints, so the BIC falls without end. For "grasping" samples, whose fingertips
+    roll, the BIC has a minimum. The `observer` is called with each number of Gaussians.
+
+    Raises `BadArgument` for too few samples, codes not of three fingers, or a joint that does not
+    vary. Raises `IndefiniteCovariance` if a Gaussian collapses more than three times: its
+    covariance becomes singular, or it has too few samples.
 
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
     >>> growing_bic(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), most=3).components

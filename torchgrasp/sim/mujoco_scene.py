@@ -112,8 +112,8 @@ class MujocoScene(SimulatedScene):
         return [(size, [*impulse, *moment, size, *(sign * x for x in force)])]
 
     def keep(self) -> "Callable[[], MujocoScene]":
-        """Return a function without arguments; each call returns a new copy of this scene, in the
-        state of now.
+        """Return a function without arguments; each call returns a new copy of this scene as it is
+        now.
 
         The copies share the MuJoCo model of this scene.
         """

@@ -80,8 +80,8 @@ class SapienScene(SimulatedScene):
         self._tip_index = [self.hand.links.index(tip) for tip in self.tips]
 
     def keep(self) -> "Callable[[], SapienScene]":
-        """Return a function without arguments; each call returns a new copy of this scene, in the
-        state of now.
+        """Return a function without arguments; each call returns a new copy of this scene as it is
+        now.
 
         The function repeats all calls so far in a fresh scene, so it takes as long as they did.
         PhysX can store the state of its bodies, but not that of its contacts.

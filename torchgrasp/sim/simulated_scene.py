@@ -155,8 +155,8 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def keep(self) -> "Callable[[], SimulatedScene]":
-        """Return a function without arguments; each call returns a new copy of this scene, in the
-        state of now.
+        """Return a function without arguments; each call returns a new copy of this scene as it is
+        now.
 
         Each copy continues with bitwise the same results as this scene. So several pulls can start
         from one closed grasp.
