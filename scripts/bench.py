@@ -27,7 +27,7 @@ SUBJECTS = ("close", "gpu", "headline", "plan", "scene")
 
 
 def command(subject: str) -> Callable[[Options], None]:
-    """Return the command that runs the benches of a subject."""
+    """Return the function that runs the benches of a subject, a subcommand of this script."""
 
     def run(options: tyro.conf.OmitArgPrefixes[Options]) -> None:
         if subject != "headline":

@@ -49,8 +49,10 @@ FRICTION = 0.8
 
 
 def draw_band(path: Path) -> None:
-    """Draw the surface that is estimated at one height, its bands, the true outline and what was
-    seen there.
+    """Draw a slice through the estimated shape of the jug, and write the picture to `path`.
+
+    It shows the estimated surface at one height with its bands of uncertainty. It also shows the
+    true outline, and the points that the camera saw there.
     """
     jug = load_object("jug")
     shape = fit_shape(jug.view, table=0.0)
@@ -86,8 +88,10 @@ def draw_band(path: Path) -> None:
 
 
 def draw_contacts(axes: Axes, degrees: tuple[float, ...]) -> None:
-    """Draw three contacts on a tin from above with their friction cones, and what the certificate
-    says of them.
+    """Draw three contacts on a tin seen from above, with their friction cones, on `axes`.
+
+    `degrees` are the directions of the contacts from the tin's middle. The title says whether the
+    contacts are certified to close.
     """
     radius = 0.033
     spec = ContactSpec(friction=FRICTION)
@@ -112,7 +116,7 @@ def draw_contacts(axes: Axes, degrees: tuple[float, ...]) -> None:
 
 
 def draw_certificates(path: Path) -> None:
-    """Draw contacts that close, and contacts that do not."""
+    """Draw contacts that are certified to close beside contacts that are not; write the picture."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(6.4, 3.4), dpi=110, layout="constrained")
     draw_contacts(left, (30.0, 150.0, 270.0))
     draw_contacts(right, (30.0, 90.0, 150.0))
@@ -130,7 +134,11 @@ FRONT = np.array([0.0, -0.055, 0.0])
 
 
 class Panel(NamedTuple):
-    """A picture of a drag: its title, the hand's joints and pose, and how far the object is [m]."""
+    """One picture of a drag.
+
+    `joints` (h,) [rad or m] and `pose` (4, 4) [m] are the hand's. `moved` (3,) [m] is the
+    displacement of the object so far.
+    """
 
     title: str
     joints: torch.Tensor
@@ -139,7 +147,7 @@ class Panel(NamedTuple):
 
 
 def draw_drag(path: Path) -> None:
-    """Draw how a hand drags a low box over the edge of a table and pinches it there."""
+    """Draw in three pictures how a hand drags a low box over a table's edge and pinches it."""
     box = trimesh.creation.box([0.12, 0.06, 0.01]).apply_translation([0.0, 0.0, 0.005])
     cloud = partial_view(box, look_at(-135.0, 40.0, target=box))
     hand = load_hand("barrett")
@@ -190,17 +198,17 @@ def draw_drag(path: Path) -> None:
 
 
 def project(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the pixels (n, 2) of points (n, 3) [m] in a picture of the size `SHOT`."""
+    """Return the pixels (column, row), (n, 2), of points (n, 3) [m] in a picture of size `SHOT`."""
     right, up, back = camera.frame @ (points - camera.position).T
     scale = SHOT[1] / (2 * math.tan(camera.angle / 2))
     return np.stack([SHOT[0] / 2 - scale * right / back, SHOT[1] / 2 + scale * up / back], -1)
 
 
 def main(out: Path = Path(__file__).parents[1] / "docs") -> None:
-    """Draw the pictures.
+    """Draw the pictures of docs/concepts.md and docs/edge.md.
 
     Args:
-        out: folder to write.
+        out: folder of the pictures.
     """
     torch.set_num_threads(1)
     draw_band(out / "concepts_band.png")

@@ -69,7 +69,7 @@ COMMANDS = (
 
 
 def digest(*parts: Any) -> str:
-    """Return the SHA-256 of tensors, arrays and text."""
+    """Return the first 16 hexadecimal digits of the SHA-256 of tensors, arrays, text and None."""
     sha = hashlib.sha256()
     for part in parts:
         if part is None:
@@ -84,7 +84,7 @@ def digest(*parts: Any) -> str:
 
 
 def hash_grasps(grasps: Any) -> str:
-    """Return the hash of the rows of grasps."""
+    """Return the hash of all numbers of grasps: joints, poses, contacts, certificates, statuses."""
     contacts = grasps.contacts
     certificate = grasps.certificate
     return digest(
@@ -95,7 +95,10 @@ def hash_grasps(grasps: Any) -> str:
 
 
 def see(name: str, k: int) -> Any:
-    """Return view k of a shipped object."""
+    """Return view k of the shipped object `name`, a cloud [m].
+
+    View 0 is the shipped one; the others are rendered from 60 k degrees.
+    """
     import trimesh
 
     from torchgrasp import cloud_from_depth, load_object
@@ -111,7 +114,7 @@ def see(name: str, k: int) -> Any:
 
 
 def plan(name: str, k: int, hand: str, mode: Mode) -> str:
-    """Return the hash of the grasps that are planned on a view."""
+    """Plan grasps of a hand on view k of a shipped object, and return their hash."""
     from torchgrasp import ContactSpec, load_hand, plan_grasps
 
     spec = (ContactSpec.paper if mode == "paper" else ContactSpec)(table=0.0)
@@ -120,7 +123,10 @@ def plan(name: str, k: int, hand: str, mode: Mode) -> str:
 
 
 def close(name: str, hand: str, how: str) -> str:
-    """Return the hash of a closing, a lift of 20 mm and what the simulator measured."""
+    """Close a hand on a shipped object and lift it 20 mm; return the hash of what was measured.
+
+    `how` is a key of `CLOSINGS`, such as "impedance".
+    """
     from torchgrasp import SensorModel, TrialSpec, close_hand, fit_shape, load_hand, load_object
     from torchgrasp.data.shipped import load_shipped_grasp
     from torchgrasp.shape.surface import surface_field
@@ -145,7 +151,7 @@ def close(name: str, hand: str, how: str) -> str:
 
 
 def lift(k: int) -> str:
-    """Return the verdict of a case of the golden set."""
+    """Return as text whether the grasp of case k of the golden set held, and whether it should."""
     from torchgrasp.evaluation.golden import run_golden
 
     result = list(run_golden("sapien"))[k]
@@ -153,7 +159,7 @@ def lift(k: int) -> str:
 
 
 def export(name: str, hand: str) -> str:
-    """Return the hash of the shipped grasp in each format of other programs."""
+    """Return the hash of a shipped grasp, exported to the formats of other programs."""
     from torchgrasp import load_hand
     from torchgrasp.data.shipped import load_shipped_grasp
     from torchgrasp.export import format_graspgen, format_grasps, format_keyframes
@@ -165,7 +171,10 @@ def export(name: str, hand: str) -> str:
 
 
 def run_command(words: str) -> str:
-    """Return the hash of what a command prints, without paths and times, and its exit code."""
+    """Run a command of torchgrasp, and return the hash of its exit code and of what it prints.
+
+    Paths and times in the output are replaced. In `words`, {data} and {out} stand for folders.
+    """
     from torchgrasp.app.cli import main
     from torchgrasp.data.shipped import DATA
     from torchgrasp.hand import hands_folder
@@ -198,7 +207,10 @@ JOBS: dict[str, tuple[Callable[..., str], list[tuple[Any, ...]]]] = {
 
 
 def compute(job: tuple[str, tuple[Any, ...]]) -> tuple[str, str]:
-    """Return the name of a hash and the hash; of a failure, the error."""
+    """Return (name, hash) of a job, which is a part of `JOBS` and its arguments.
+
+    A failure has its error in place of the hash.
+    """
     torch.set_num_threads(1)
     part, arguments = job
     try:
@@ -211,7 +223,10 @@ def compute(job: tuple[str, tuple[Any, ...]]) -> tuple[str, str]:
 
 
 def compute_all(parts: Iterable[str], every: int, workers: int) -> dict[str, str]:
-    """Return the hashes of some parts by name, of which only each so many-th is computed."""
+    """Return the hashes of some parts of `JOBS` by name, computed in `workers` processes.
+
+    With `every` = 3, only each third hash of a part is computed.
+    """
     jobs = [(part, arguments) for part in parts for arguments in JOBS[part][1][::every]]
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
@@ -219,7 +234,7 @@ def compute_all(parts: Iterable[str], every: int, workers: int) -> dict[str, str
 
 
 def main() -> int:
-    """Save hashes, or compare them."""
+    """Compute hashes, save them to a file or compare them with one; return the exit code."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     add_option = parser.add_argument
     add_option("--save", type=Path, help="file that the hashes are written to")

@@ -37,7 +37,11 @@ NAMES = (
 
 
 class Mutant(NamedTuple):
-    """A mutant: its module, the operator and which of its occurrences."""
+    """A mutant of the library: one small change of its source.
+
+    `module` is the file's path in the repository, `operator` Cosmic Ray's name of the change.
+    `occurrence` counts the places where it can be made, from 0.
+    """
 
     module: str
     operator: str
@@ -45,7 +49,7 @@ class Mutant(NamedTuple):
 
 
 def all_mutants(folder: str) -> list[Mutant]:
-    """Return every mutant of a folder of the library."""
+    """Return every mutant of the modules of a folder of the library, such as "shape"."""
     from cosmic_ray import ast, plugins  # pyright: ignore[reportMissingImports]
 
     found = []
@@ -61,7 +65,11 @@ def all_mutants(folder: str) -> list[Mutant]:
 
 
 def try_mutant(copy: Path, mutant: Mutant, limit: float) -> dict[str, object]:
-    """Return whether the tests notice a mutant, and the changed lines."""
+    """Make a mutant in a copy of the repository, run its tests, and take the change back.
+
+    The result has the mutant's fields, the changed "line" (number, before, after), and "killed",
+    whether a test failed. A run of tests longer than `limit` [s] counts as a failure.
+    """
     from cosmic_ray import mutating, plugins  # pyright: ignore[reportMissingImports]
 
     path = copy / mutant.module
@@ -82,7 +90,10 @@ def try_mutant(copy: Path, mutant: Mutant, limit: float) -> dict[str, object]:
 
 
 def run_tests(copy: Path, module: str, limit: float) -> bool:
-    """Tell whether a test of the module's folder fails; the tests of the module run first."""
+    """Run the tests of a module, then those of its folder; tell whether one fails.
+
+    A run that takes longer than `limit` [s] counts as a failure.
+    """
     inner = Path(module).relative_to("torchgrasp")
     own = copy / "tests" / inner.parent / f"test_{inner.name}"
     folder = copy / "tests" / inner.parts[0]

@@ -31,7 +31,10 @@ JOB = "grasp cloud.ply --hand allegro --starts 200 --out mine"
 
 
 def main() -> int:
-    """Build, check and try; the exit code is 0 if all is well."""
+    """Build wheel and sdist, check them, and try the wheel with each Python; return 0.
+
+    A step that fails ends the script with a message.
+    """
     as_written = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=as_written)
     default = ROOT / "out/package"
@@ -58,8 +61,10 @@ def main() -> int:
 
 
 def run(*words: object, cwd: Path, codes: tuple[int, ...] = (0,), most: int = 3600) -> str:
-    """Run a command without the surrounding environment, and return what it printed; end here where
-    it fails.
+    """Run a command in the folder `cwd`, and return what it printed.
+
+    PYTHONPATH and PYTHONHOME are left out of its environment. The script ends with a message if the
+    exit code is not one of `codes`. `most` is the time limit [s].
     """
     own = ("PYTHONPATH", "PYTHONHOME")
     clean = {name: value for name, value in os.environ.items() if name not in own}
@@ -72,7 +77,11 @@ def run(*words: object, cwd: Path, codes: tuple[int, ...] = (0,), most: int = 36
 
 
 def build(work: Path, out: Path) -> Path:
-    """Build from a clone, check size, metadata and that the sdist lacks nothing; return the wheel."""
+    """Build wheel and sdist from a clone of the last commit, check them; return the wheel's path.
+
+    The script ends with a message if the wheel is too large or the sdist lacks a file. It ends also
+    if the metadata are wrong. `work` is a scratch folder; the files are written to `out`.
+    """
     tree = work / "tree"
     tools = work / "tools"
     run("git", "clone", "--quiet", "--no-hardlinks", ROOT, tree, cwd=work)
@@ -99,7 +108,10 @@ def build(work: Path, out: Path) -> Path:
 
 
 def find_pythons() -> list[str]:
-    """Return an interpreter of each version, of pyenv before those of PATH."""
+    """Return the path of an interpreter for each version of Python from 3.10 on that is found.
+
+    Those of pyenv come before those of PATH. If none is found, it is this interpreter.
+    """
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     found = []
     for minor in range(OLDEST, NEWEST + 1):
@@ -114,8 +126,10 @@ def find_pythons() -> list[str]:
 
 
 def try_wheel(work: Path, wheel: Path, interpreter: str, index: str | None) -> dict[str, object]:
-    """Install the wheel in an empty environment, do the main job in an empty folder, then the
-    self-test.
+    """Install the wheel in an empty environment, and run the main job and the self-test there.
+
+    The main job is a plan on a cloud in an empty folder. The result has versions, sizes and what
+    was printed. A step that fails ends the script. `index` is the index of torch; None means pip's.
     """
     environment = work / "environment"
     empty = work / "empty"
@@ -156,7 +170,7 @@ def try_wheel(work: Path, wheel: Path, interpreter: str, index: str | None) -> d
 
 
 def size_of(folder: Path) -> int:
-    """Return the bytes of all files below a folder."""
+    """Return the total size [bytes] of all files below a folder."""
     return sum(path.lstat().st_size for path in folder.rglob("*"))
 
 

@@ -49,7 +49,11 @@ WAYS = (
 
 
 class Number(NamedTuple):
-    """A number of the source: its module, the name of its constant or field, and its place."""
+    """A number that stands in the library's source.
+
+    `module` is the dotted name, `name` that of the constant or field that holds the number. `line`
+    counts from 1, `column` from 0.
+    """
 
     module: str
     name: str
@@ -70,14 +74,17 @@ class Case(NamedTuple):
 
 
 def is_number(node: ast.expr) -> bool:
-    """Tell whether an expression is a number that is written out."""
+    """Tell whether an expression is a literal number, perhaps with a sign."""
     if isinstance(node, ast.UnaryOp):
         return is_number(node.operand)
     return isinstance(node, ast.Constant) and type(node.value) in (int, float)
 
 
 def numbers_of(path: Path) -> Iterator[Number]:
-    """Yield the numbers of a file: of its constants, and of the fields of its options values."""
+    """Yield the numbers in a file that are not 0: of its constants and of its options values.
+
+    Options values are the dataclasses whose names end in Numbers or Layout.
+    """
     module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     for owner, statement in statements_of(ast.parse(path.read_text())):
         if isinstance(statement, ast.Assign | ast.AnnAssign) and statement.value is not None:
@@ -89,7 +96,10 @@ def numbers_of(path: Path) -> Iterator[Number]:
 
 
 def statements_of(tree: ast.Module) -> Iterator[tuple[str, ast.stmt]]:
-    """Yield the statements of a module and of its options values, each with its owner's name."""
+    """Yield (owner, statement) for the statements of a module and of its options values.
+
+    The owner is "" for the module, and "CLASS." for an options value.
+    """
     for statement in tree.body:
         yield "", statement
         if isinstance(statement, ast.ClassDef) and statement.name.endswith(OPTIONS):
@@ -98,13 +108,13 @@ def statements_of(tree: ast.Module) -> Iterator[tuple[str, ast.stmt]]:
 
 
 class Moved(importlib.machinery.SourceFileLoader):
-    """A loader that multiplies some numbers of a module by a factor."""
+    """A loader of modules that multiplies some `numbers` of the source by a `factor`."""
 
     numbers: Sequence[Number]
     factor: float
 
     def source_to_code(self, data: Any, path: Any, **_: Any) -> Any:
-        """Compile the source with the numbers moved."""
+        """Return the compiled source `data`, in which the numbers are multiplied by the factor."""
         tree = ast.parse(data)
         places = {(number.line, number.column) for number in self.numbers}
         for node in ast.walk(tree):
@@ -113,12 +123,12 @@ class Moved(importlib.machinery.SourceFileLoader):
         return compile(tree, path, "exec")
 
     def get_code(self, fullname: str) -> Any:
-        """Compile anew, past the cache of byte code."""
+        """Return the code of the module, compiled anew without the cache of byte code."""
         return self.source_to_code(self.get_data(self.path), self.path)
 
 
 def moved(value: Any, factor: float) -> Any:
-    """Return a number times a factor; of a whole number, a whole number near it that is another."""
+    """Return a number times a factor; a whole number is rounded, and changes by at least 1."""
     if isinstance(value, float):
         return value * factor
     near = round(value * factor)
@@ -126,14 +136,14 @@ def moved(value: Any, factor: float) -> Any:
 
 
 class Finder(importlib.abc.MetaPathFinder):
-    """Finds the modules of the numbers that are moved."""
+    """An import hook that loads the modules of some numbers with these multiplied by a factor."""
 
     def __init__(self, numbers: Sequence[Number], factor: float) -> None:
         self.numbers = numbers
         self.factor = factor
 
     def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> Any:
-        """Return a spec with the loader that moves the module's numbers."""
+        """Return the import spec of a module with a `Moved` loader; None if it has no number."""
         numbers = [number for number in self.numbers if number.module == fullname]
         if not numbers:
             return None
@@ -146,7 +156,10 @@ class Finder(importlib.abc.MetaPathFinder):
 
 
 def cases_of(folder: str, objects: Path | None, names: Sequence[str]) -> Iterator[Case]:
-    """Yield the cases on which the numbers of a folder are tried, the cheapest first."""
+    """Yield the cases on which the numbers of a folder of the library are tried, cheapest first.
+
+    `names` are further objects to plan on, in the folder `objects`; None means no such objects.
+    """
     import golden
 
     if folder in ("geometry", "cloud", "scene"):
@@ -167,7 +180,7 @@ def cases_of(folder: str, objects: Path | None, names: Sequence[str]) -> Iterato
 
 
 def see_scene() -> str:
-    """Return the hash of the table and the objects that are found in a depth image."""
+    """Return the hash of the table and the objects that are found in the shipped depth image."""
     import golden
 
     from torchgrasp import Scene, load_scene
@@ -179,7 +192,7 @@ def see_scene() -> str:
 
 
 def find_probabilities() -> str:
-    """Return the hash of the probabilities of closure and of holding of shipped grasps."""
+    """Return the hash of a shipped grasp's probabilities of closure and of holding."""
     import golden
 
     import torchgrasp as tg
@@ -197,7 +210,7 @@ def find_probabilities() -> str:
 
 
 def plan_scene() -> str:
-    """Return the hash of the plan of a scene."""
+    """Return the hash of the best grasps that are planned in the shipped scene; "none" without."""
     import golden
 
     from torchgrasp import load_hand, load_scene, plan_scene
@@ -207,7 +220,7 @@ def plan_scene() -> str:
 
 
 def plan_object(objects: Any, name: str) -> str:
-    """Return the hash of the plan of an object in a folder."""
+    """Return the hash of the grasps that are planned on the first view of an object in a folder."""
     import golden
 
     from torchgrasp import ContactSpec, load_hand, plan_grasps
@@ -219,7 +232,10 @@ def plan_object(objects: Any, name: str) -> str:
 
 
 def compute(numbers: Sequence[Number], factor: float, case: Case) -> str:
-    """Return the hash of a case with some numbers moved; of an error, its text."""
+    """Return the hash of a case in a library whose `numbers` are multiplied by `factor`.
+
+    An error gives its text in place of the hash. Without numbers it is raised.
+    """
     import torch
 
     torch.set_num_threads(1)
@@ -239,7 +255,11 @@ def _work(job: Any, pipe: Any) -> None:
 
 
 def in_child(*job: Any) -> str:
-    """Run `compute` in a fork, which has loaded the large packages but nothing of torchgrasp."""
+    """Run `compute` with the arguments `job` in a child process, and return its result.
+
+    The child has loaded the large packages but nothing of torchgrasp. A child that dies gives
+    "died".
+    """
     context = multiprocessing.get_context("fork")
     mine, its = context.Pipe()
     process = context.Process(target=_work, args=(job, its))
@@ -276,7 +296,10 @@ def that_change(numbers: Sequence[Number], factor: float, case: Case, before: st
 
 
 def try_folder(folder: str, objects: Path | None, names: Sequence[str]) -> dict[str, str]:
-    """Return for each number of a folder the first case that it changes, or "no effect"."""
+    """Return for each number of a folder the name of the first case that it changes.
+
+    Numbers are by `Number.key`; one that changes no case has "no effect".
+    """
     paths = sorted((ROOT / "torchgrasp" / folder).rglob("*.py"))
     numbers = [number for path in paths for number in numbers_of(path)]
     found = {}

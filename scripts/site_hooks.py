@@ -45,7 +45,7 @@ LINK = re.compile(r"\]\(([^)#:]+)(#[^)]*)?\)")
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages from outside."""
+    """Add the files of `OUTSIDE` to the site's files as pages, with their links rewritten."""
     for path, name in OUTSIDE.items():
         if (ROOT / path).is_dir():
             text = _list_examples()
@@ -63,7 +63,10 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Let links of the guides to files outside lead to their pages; write the table of statuses."""
+    """Return the Markdown of a page in docs/ with the table of statuses and with links of the site.
+
+    Links to files outside docs/ lead to the pages of these files.
+    """
     if page.file.generated_by:
         return markdown
     markdown = markdown.replace(STATUSES, list_statuses())
@@ -72,18 +75,21 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_post_page(output: str, page: Any, **_: Any) -> str:
-    """Take the script with which the search works from a folder from the site itself."""
+    """Return a page's HTML in which the script for the offline search is loaded from the site.
+
+    Otherwise it would be loaded from another server.
+    """
     up = "../" * page.url.count("/")
     return output.replace(WORKER, f"{up}assets/worker.js")
 
 
 def on_post_template(output_content: str, **_: Any) -> str:
-    """Do the same for the page of a dead link."""
+    """Return the HTML of the page for dead links, with the script for the search from the site."""
     return output_content.replace(WORKER, "/assets/worker.js")
 
 
 def list_statuses() -> str:
-    """Return a table of all statuses as Markdown."""
+    """Return a Markdown table of all members of `Status`: code, name and meaning."""
     rows = [f"| {int(one)} | `{one.name}` | {one.sentence} |" for one in sorted(Status)]
     return "\n".join(["| code | name | meaning |", "| --- | --- | --- |", *rows])
 
@@ -142,10 +148,13 @@ def _relink(text: str, folder: Path, up: str = "") -> str:
 
 
 class FenceExamples(griffe.Extension):
-    """Fence `>>>` blocks of docstrings: Markdown takes them for quotes."""
+    """An extension of griffe that fences `>>>` blocks of docstrings.
+
+    Markdown would take them for quotes.
+    """
 
     def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Rewrite the docstring of an object."""
+        """Rewrite the docstring of an object by `fence`."""
         if obj.docstring is not None:
             obj.docstring.value = fence(obj.docstring.value)
 
@@ -155,16 +164,22 @@ ARGUMENTS = re.compile(r"^( +)(\w+(?:, \w+)+): (.*(?:\n\1 +\S.*)*)", re.MULTILIN
 
 
 class OneRowEach(griffe.Extension):
-    """Give each argument its own row: rows of several show neither types nor defaults."""
+    """An extension of griffe that gives each argument of a docstring a row of its own.
+
+    A row of several arguments would show neither types nor defaults.
+    """
 
     def on_function(self, *, func: griffe.Function, **_: Any) -> None:
-        """Rewrite the docstring of a function."""
+        """Rewrite the docstring of a function by `split_arguments`."""
         if func.docstring is not None:
             func.docstring.value = split_arguments(func.docstring.value)
 
 
 def split_arguments(text: str) -> str:
-    """Return a docstring in which each entry of "Args:" documents one argument."""
+    """Return a docstring in which each entry of "Args:" documents one argument.
+
+    An entry "a, b: words" becomes two entries with the same words.
+    """
     start = text.find("Args:\n")
     if start < 0:
         return text

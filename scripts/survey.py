@@ -26,8 +26,10 @@ COUNTED = {tokenize.NAME, tokenize.OP, tokenize.NUMBER}
 
 
 class Counts(NamedTuple):
-    """The counts of a file or a folder. A line has code; packed assignments have tuples on both
-    sides.
+    """The counts of the source of a file or a folder.
+
+    `lines` are lines with code. `packed` are those of the `assignments` that have tuples on both
+    sides. `numbers` are those in function bodies that need a name.
     """
 
     files: int = 0
@@ -67,7 +69,9 @@ def count(source: str) -> Counts:
 
 
 def count_lines(source: str, tree: ast.Module) -> int:
-    """Return how many lines have code: no docstring, no comment, nothing empty."""
+    """Return the number of lines of a source with code: docstrings, comments and empty lines do not
+    count.
+    """
     told: set[int] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
@@ -81,7 +85,7 @@ def count_lines(source: str, tree: ast.Module) -> int:
 
 
 def numbers_in_bodies(tree: ast.Module) -> Iterator[ast.Constant]:
-    """Yield the numbers in function bodies that belong in an options value."""
+    """Yield the literal numbers in function bodies that need a name (`is_tuned`)."""
     for function in ast.walk(tree):
         if not isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
@@ -94,7 +98,8 @@ def numbers_in_bodies(tree: ast.Module) -> Iterator[ast.Constant]:
 
 
 def is_tuned(value: object) -> bool:
-    """Tell whether a value is a number that needs a name.
+    """Tell whether a value is a number that needs a name: neither neutral, nor a unit, nor a small
+    count.
 
     >>> is_tuned(0.35), is_tuned(0.5), is_tuned(3), is_tuned(True)
     (True, False, False, False)
@@ -105,7 +110,9 @@ def is_tuned(value: object) -> bool:
 
 
 def twice(places: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
-    """Return the names that occur at several places.
+    """Return the names that occur at several places, each with its places.
+
+    `places` are pairs of name and place.
 
     >>> twice([("Row", "a.py"), ("Row", "b.py"), ("Cell", "a.py")])
     {'Row': ['a.py', 'b.py']}
@@ -117,14 +124,14 @@ def twice(places: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
 
 
 def exported(tree: ast.Module) -> Iterator[str]:
-    """Yield the names in `__all__`."""
+    """Yield the names in the list `__all__` of a module."""
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             yield from ast.literal_eval(node.value)
 
 
 def report(package: Path) -> str:
-    """Return the counts of a package by its folders, and the names that occur twice."""
+    """Return as text the counts of a package by its folders, and the names that occur twice."""
     folders = defaultdict(Counts)
     files = list[tuple[str, str]]()
     classes = list[tuple[str, str]]()

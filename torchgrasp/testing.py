@@ -27,12 +27,12 @@ __all__ = ["BrokenLaw", "check_hand"]
 
 @dataclasses.dataclass(frozen=True)
 class LawNumbers:
-    """Steps and tolerances of the laws that the kinematics of a hand must obey."""
+    """Steps and tolerances with which `check_hand` tests the files and the kinematics of a hand."""
 
     step: float = 1e-6
     """Step [rad] of central differences."""
     jacobian: float = 1e-6
-    """Largest difference [m/rad] of central differences from the Jacobian."""
+    """Largest difference [m/rad] of central differences from the fingertips' Jacobian."""
     rounding: float = 1e-6
     """Largest error of a joint [rad or m], and largest relative error of the sum of two principal
     inertias.
@@ -54,8 +54,9 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     """Check the files and kinematics of a hand with a choice of grasping fingers, and return the
     hand.
 
-    The rules for the files concern coupling, limits, drives, masses, pads, parked joints and
-    self-collision. The kinematics of the loaded hand must obey three laws, by name:
+    The rules for the files concern couplings, limits, motors and masses. They also concern the
+    pads, the fixed positions of joints that do not grasp, and self-collision. The kinematics of the
+    loaded hand must obey three laws, by name:
 
     * "kinematics": the poses of all links are those that the URDF library yourdfpy computes.
     * "jacobian": the Jacobian of the fingertips equals central differences.
@@ -66,8 +67,8 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
         fingers: the grasping fingers, as in `load_hand`.
 
     Raises:
-        HandFileError: a file breaks a rule, is missing or malformed. The links of the hand meet in
-            all random postures.
+        HandFileError: a file breaks a rule, is missing or malformed. Or links of the hand overlap
+            in all of 2000 random postures.
         BrokenLaw: the kinematics break a law; `law` is the name of the first.
         BadArgument: the hand has no such fingers.
 
@@ -128,10 +129,11 @@ def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
 
 
 def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Iterator[HandFileError]:
-    """Yield an error for each rule that the files of a hand break.
+    """Yield an error, without raising it, for each place where the files of a hand break a rule.
 
-    The rules are those of `check_hand`; its three laws of kinematics are not tested. Raises
-    `HandFileError` or `BadArgument` if `load_hand` cannot load the hand.
+    The rules concern masses, inertias, motors, joint limits, couplings and pads. Raises
+    `HandFileError` if the hand is missing or malformed, and `BadArgument` if it has no such
+    fingers.
     """
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
     urdf = read_urdf(spec.urdf)
@@ -144,7 +146,7 @@ def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Itera
 def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:
     """Return the names of the two links of a hand that overlap in the largest number of n postures.
 
-    `joints` (n, h) are positions of the h actuated joints [rad].
+    `joints` (n, h) are positions of the h actuated joints [rad or m].
     """
     apart = hand.self_collision.separations(
         hand.tree.frames(hand.expand_joints(joints).T.contiguous()), 0.0
@@ -211,11 +213,11 @@ def _inside(point: np.ndarray, shape: LinkShape) -> bool:
 
 
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
-    """Return the largest difference between a link's pose and that of yourdfpy, and the name of the
-    link.
+    """Return the largest difference of a link's pose from that of the library yourdfpy, and the
+    link's name.
 
     A difference is that of one entry of a pose (4, 4): of a translation [m], or of a rotation
-    matrix (no unit). `joints` (n, h) are positions of the h actuated joints [rad].
+    matrix (no unit). `joints` (n, h) are n postures: positions of the h actuated joints [rad or m].
     """
     urdf = read_urdf(hand.urdf_path)
     poses = hand.link_poses(joints).double()

@@ -1,1 +1,1 @@
-"""What scripts/bench.py measures, one file a subject."""
+"""What scripts/bench.py measures: a folder for each subject, with a file for each bench or two."""

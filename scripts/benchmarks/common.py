@@ -1,4 +1,6 @@
-"""What every benchmark needs: options, a registry, rows with a target, results as files, a clock."""
+"""What every bench of scripts/bench.py needs: options, a registry, rows with a target, results as
+files, a clock.
+"""
 
 import dataclasses
 import importlib
@@ -35,8 +37,9 @@ Result = TypeVar("Result")
 
 
 def mean_over(values: Iterable[tuple[str, float]]) -> Share:
-    """Return the mean, with its 95 % interval, of values given as pairs of unit name and value. NaN
-    is left out.
+    """Return the mean of values with its 95 % interval over units, such as families of objects.
+
+    A value is given as a pair: name of its unit, value. NaN is left out.
     """
     return contrast_over([sum_by(values)], [1.0])
 
@@ -52,7 +55,10 @@ def sum_by(values: Iterable[tuple[str, float]]) -> dict[str, tuple[float, int]]:
 
 
 def format_number(share: Share, sign: str = "+") -> str:
-    """Return a mean or a difference with its interval as text."""
+    """Return a mean or a difference with its interval as text: "value [low, high]".
+
+    `sign` is the sign's option of a format; "+" shows the sign of positive numbers, too.
+    """
     return f"{share.value:{sign}.3f} [{share.low:{sign}.3f}, {share.high:{sign}.3f}]"
 
 
@@ -103,13 +109,18 @@ class Options:
     publish: bool = False
 
     def times(self, number: int) -> int:
-        """Return a number of samples times the scale, at least 1."""
+        """Return a number of samples times the option `scale`, rounded, at least 1."""
         return max(1, round(number * self.scale))
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One measured number beside its target; `met` is None without a target or a measurement."""
+    """One row of a bench's results: a measured number beside its target.
+
+    `what` says what was measured; `bar` is the target and `measured` the result, as text. `met`
+    tells whether the target is met; None without a target or a measurement. `numbers` are the
+    results by name, for the JSON file.
+    """
 
     what: str
     bar: str
@@ -123,7 +134,7 @@ class Row:
 
 
 class Bench(NamedTuple):
-    """A function of options that returns rows, and whether it needs folders of objects."""
+    """A bench: a function of options that returns rows, and whether it needs folders of objects."""
 
     run: Callable[[Options], list[Row]]
     objects: bool
@@ -134,7 +145,10 @@ BENCHES: dict[str, Bench] = {}
 
 
 def bench(name: str, objects: bool = False) -> Callable[[Callable[[Options], list[Row]]], Callable]:
-    """Register a function as a bench."""
+    """Return a decorator that registers a function of options as the bench `name`.
+
+    A name is "SUBJECT/BENCH". `objects` says whether the bench needs folders of objects.
+    """
 
     def register(run: Callable[[Options], list[Row]]) -> Callable:
         BENCHES[name] = Bench(run, objects)
@@ -144,7 +158,7 @@ def bench(name: str, objects: bool = False) -> Callable[[Callable[[Options], lis
 
 
 def benches_of(subject: str) -> dict[str, Bench]:
-    """Return the benches of a subject by their short names."""
+    """Return the benches of a subject by their names without the subject, such as "table-lift"."""
     package = importlib.import_module(f"benchmarks.{subject}")
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"benchmarks.{subject}.{module.name}")
@@ -152,7 +166,10 @@ def benches_of(subject: str) -> dict[str, Bench]:
 
 
 def measure(subject: str, options: Options) -> list[Row]:
-    """Run the benches that are asked for, print their rows, and write them as JSON and as Markdown."""
+    """Run the benches of a subject that the options ask for, and return their rows.
+
+    The rows are printed, and written as JSON and as a Markdown table.
+    """
     known = benches_of(subject)
     if unknown := sorted(set(options.only) - set(known)):
         raise SystemExit(
@@ -184,14 +201,16 @@ def measure(subject: str, options: Options) -> list[Row]:
 
 
 def keep(path: Path, make: Callable[[], Any]) -> Any:
-    """Return the content of a JSON file, which is made first where it does not exist."""
+    """Return the content of a JSON file; if there is none, it is written from what `make` gives."""
     if not path.is_file():
         write_file(path, format_json(make()))
     return json.loads(path.read_text("utf-8"))
 
 
 def is_fixed(commit: str) -> bool:
-    """Return whether the text on a commit names one, without changes of the working tree."""
+    """Return whether a text of `describe_commit` names a commit, without changes of the working
+    tree.
+    """
     return CHANGED not in commit and UNKNOWN not in commit
 
 
@@ -200,10 +219,10 @@ CHOICES = ("only", "out", "publish", "workers")
 
 
 def keep_rows(options: Options, name: str, measure_rows: Callable[[], list[Row]]) -> list[Row]:
-    """Return the rows of a stopped run of the same commit and options, or measure and keep them.
+    """Return the rows of a bench: those that an earlier run of the same commit and options kept.
 
-    Rows are kept in the folder `out`. They are measured again while the working tree has changes,
-    or without git.
+    If there are none, `measure_rows` returns them, and they are kept in a file in the folder `out`.
+    Rows are measured again while the working tree has changes, or without git.
     """
     run = describe_run(options.threads)
     settings = {k: v for k, v in dataclasses.asdict(options).items() if k not in CHOICES}
@@ -220,13 +239,19 @@ def keep_rows(options: Options, name: str, measure_rows: Callable[[], list[Row]]
 
 
 def write_table(folder: Path, name: str, rows: list[Row], options: Options) -> None:
-    """Write rows as a Markdown table with commit, machine and command."""
+    """Write rows as a Markdown table to the file NAME.md of a folder, with commit, machine and
+    command.
+    """
     lines = [f"# {name}", "", *describe_rows(rows, options)]
     write_file(folder / f"{name}.md", "\n".join(lines) + "\n")
 
 
 def write_section(page: Path, heading: str, rows: list[Row], options: Options) -> None:
-    """Write the same as the last section of a page, in place of one with this heading."""
+    """Write rows as a Markdown table, with commit, machine and command, as the last section of a
+    page.
+
+    It takes the place of a section with the same heading.
+    """
     text = page.read_text("utf-8")
     section = re.compile(rf"\n## {re.escape(heading)}\n.*?(?=\n## |\Z)", re.DOTALL)
     lines = ["", f"## {heading}", "", *describe_rows(rows, options)]
@@ -234,18 +259,18 @@ def write_section(page: Path, heading: str, rows: list[Row], options: Options) -
 
 
 def describe_rows(rows: list[Row], options: Options) -> list[str]:
-    """Return the lines of command, commit and machine, and of a table of rows."""
+    """Return lines of Markdown: the command, then commit and machine, then a table of the rows."""
     return [f"`{command_line()}`", "", describe_run(options.threads), "", *format_rows(rows)]
 
 
 def command_line() -> str:
-    """Return the command that runs this bench, as it was typed, with DIR for folders of data."""
+    """Return the command line of this process, with DIR in place of absolute paths."""
     words = ["DIR" if Path(word).is_absolute() else word for word in sys.argv[1:]]
     return " ".join(["scripts/bench.py", *words])
 
 
 def format_rows(rows: Iterable[Row]) -> list[str]:
-    """Return the lines of a Markdown table of rows."""
+    """Return the lines of a Markdown table of rows: what, target, measured, met."""
     lines = ["| what | target | measured | met |", "| --- | --- | --- | --- |"]
     for row in rows:
         cells = row.what, row.bar, row.measured, {True: "yes", False: "no", None: "-"}[row.met]
@@ -254,7 +279,9 @@ def format_rows(rows: Iterable[Row]) -> list[str]:
 
 
 def describe_commit() -> str:
-    """Return the short name of the commit, and whether the working tree has changes."""
+    """Return the short hash of the present commit as text, and a word if the working tree has
+    changes.
+    """
 
     def git(*words: str) -> str:
         return subprocess.run(
@@ -268,7 +295,9 @@ def describe_commit() -> str:
 
 
 def describe_run(threads: int) -> str:
-    """Return commit, processor, threads, version of torch, and loops on or off, in one line."""
+    """Return a line of text with commit, processor, threads, version of torch, and whether loops
+    are compiled.
+    """
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
@@ -282,7 +311,7 @@ def describe_run(threads: int) -> str:
 def timed(
     action: Callable[[], Result], clock: Callable[[], float] = time.process_time
 ) -> tuple[Result, float]:
-    """Return the result of an action, and the time that it took [s], by default the processor's."""
+    """Return (result, seconds) of an action; by default the seconds are processor time."""
     began = clock()
     return action(), clock() - began
 
@@ -290,8 +319,10 @@ def timed(
 def run_all(
     work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], workers: int, limit: float
 ) -> Iterator[Any]:
-    """Yield the result of each task; a task that fails, or takes longer than `limit` [s], ends the
-    bench.
+    """Call `work` for each task in several processes, and yield the results in the order of tasks.
+
+    A task holds the arguments of a call. A task that fails, or takes longer than `limit` [s], ends
+    the bench.
     """
     for k, found in enumerate(run_tasks(work, tasks, workers, limit)):
         if isinstance(found, Status):

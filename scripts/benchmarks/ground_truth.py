@@ -26,8 +26,9 @@ on the table.
 def read_views(
     objects: Path, views: Sequence[str] = ()
 ) -> Iterator[tuple[str, str, PointCloud, trimesh.Trimesh]]:
-    """Yield object, view, noisy cloud and true mesh of every view, or of those with a name in
-    `views`.
+    """Yield (object, view, noisy cloud, true mesh) of each view in a folder of objects.
+
+    `views` are the names of the views; empty means all. Cloud and mesh [m] are in one frame.
     """
     for name, view in list_views(objects):
         if views and view not in views:
@@ -36,7 +37,10 @@ def read_views(
 
 
 def read_cameras(folder: Path) -> dict[str, dict[str, Float[Tensor, "n 3"]]]:
-    """Return the points [m] of real things by camera, of a folder of files NAME_CAMERA.ply."""
+    """Return the points (n, 3) [m] of real things, by the thing's name, then by camera.
+
+    The folder has files NAME_CAMERA.ply.
+    """
     clouds: dict[str, dict[str, Tensor]] = defaultdict(dict)
     for path in sorted(folder.glob("*_*.ply")):
         name, camera = path.stem.rsplit("_", 1)
@@ -45,8 +49,10 @@ def read_cameras(folder: Path) -> dict[str, dict[str, Float[Tensor, "n 3"]]]:
 
 
 def sample_hidden(mesh: trimesh.Trimesh, cloud: PointCloud, n: int) -> Float[Tensor, "k 3"]:
-    """Return those of n random points of a mesh [m] that a cloud does not show. The face on the
-    table is left out.
+    """Draw n points from the surface of a mesh [m], and return those that a cloud does not show.
+
+    They are farther than `HIDDEN` [m] from all points of the cloud. The face on the table is left
+    out.
     """
     points, faces = trimesh.sample.sample_surface(mesh, n, seed=0)[:2]
     low = mesh.bounds[0, 2] + TABLE_FACE

@@ -76,7 +76,9 @@ def fig4(out: Path, seed: int = 0) -> None:
 
 
 def observed_normals(shape: ShapeGP) -> tuple[np.ndarray, np.ndarray]:
-    """Return the observed points [m] of the surface and the shape's normals there."""
+    """Return (points, normals): the points (n, 3) [m] that a shape observes on the surface, and its
+    unit normals there.
+    """
     points = shape.metres(shape.x[shape.has_normal])
     return points.numpy(), shape.predict(points).normal.numpy()
 
@@ -88,8 +90,11 @@ def draw(
     corners: np.ndarray,
     eye: tuple[float, float, float],
 ) -> Image.Image:
-    """Draw points by height, or a surface by its standard deviation up to `most` [mm] with arrows
-    on it.
+    """Return a picture of a cloud coloured by height, or of a surface coloured by its deviation.
+
+    The colours of the standard deviation end at `most` [mm]. `arrows` are points [m] and directions
+    to draw, or None. `corners` (n, 3) [m] must be in the picture, and `eye` is the direction to the
+    viewer.
     """
     canvas = Canvas()
     if isinstance(what, PointCloud):

@@ -62,7 +62,11 @@ def fig6(out: Path, n: int = 40_000, apart: int = 20_000, folds: int = 10, seed:
 
 
 def draw_selection(curves: dict[str, tuple[BicCurve, CrossValidation]], out: Path) -> None:
-    """Draw a row for each hand: the criterion, the held-out log-likelihood, the held-out error."""
+    """Draw a row for each hand, and write the picture to `out`.
+
+    It has the information criterion, the held-out log-likelihood and the held-out error over the
+    number of Gaussians. `curves` has both by the hand's name.
+    """
     figure = Figure(figsize=(12, 3.2 * len(curves)), layout="constrained")
     axes = figure.subplots(len(curves), 3, squeeze=False)
     for (name, (curve, crossed)), row in zip(curves.items(), axes, strict=True):

@@ -48,8 +48,8 @@ FRAME = 0.03
 
 @dataclasses.dataclass(frozen=True)
 class Taken:
-    """Grasps of one hand on one object that passed every check of the paper's chain, and the
-    estimated surface.
+    """Grasps of one hand on one object that passed every check of mode "paper", and the estimated
+    surface.
     """
 
     hand: Hand
@@ -88,8 +88,9 @@ def grasps(out: Path, starts: int = 1000, seed: int = 0, only: tuple[str, ...] =
 
 
 def take(name: str, hand: Hand, starts: int, seed: int) -> Taken:
-    """Return the executable grasps of the paper's chain on one object, those of least variance
-    first.
+    """Plan grasps of a hand on a shipped object in mode "paper", and return the executable ones.
+
+    Those whose contacts have the least variance come first.
     """
     stages = dict[str, Any]()
 
@@ -102,8 +103,10 @@ def take(name: str, hand: Hand, starts: int, seed: int) -> Taken:
 
 
 def unlike_pair(taken: Taken) -> tuple[Taken, int, int, float] | None:
-    """Return the two grasps of one triple whose hands point apart the most, and the angle between
-    them [rad].
+    """Return the two grasps of one contact triple whose hands point apart the most.
+
+    The result is (taken, first, second, angle): indices into `taken.grasps`, and the angle [rad]
+    between both approaches. It is None if no two grasps have the same triple.
     """
     center = taken.grasps.contacts.points.mean(1)
     same = (torch.linalg.vector_norm(center[:, None] - center, dim=-1) < 1e-6).triu(1)
@@ -116,8 +119,10 @@ def unlike_pair(taken: Taken) -> tuple[Taken, int, int, float] | None:
 
 
 def shared_triple(first: Taken, other: Hand) -> list[tuple[Taken, int]]:
-    """Return a grasp of each hand on one triple. On those that the first hand takes, the other hand
-    is tried, too.
+    """Return a grasp of each hand on one contact triple, as pairs of grasps and index.
+
+    The `other` hand is tried on the triples that the first hand takes. The list is empty if it
+    reaches none.
     """
     surface = first.surface
     contacts = first.grasps.contacts
@@ -138,7 +143,10 @@ def shared_triple(first: Taken, other: Hand) -> list[tuple[Taken, int]]:
 
 
 def save(rows: list[list[tuple[Taken, int]]], path: Path) -> None:
-    """Draw grasps, those of one contact triple in a row and from one eye, else two in a row."""
+    """Draw grasps, two side by side, and write the sheet to `path`.
+
+    A row has one grasp, or two of one contact triple, which are seen from one direction.
+    """
     shown = [(*one, eye_of(row)) for row in rows for one in row]
     captions = {}
     for k, (taken, index, _) in enumerate(shown):
@@ -149,8 +157,9 @@ def save(rows: list[list[tuple[Taken, int]]], path: Path) -> None:
 
 
 def eye_of(row: list[tuple[Taken, int]]) -> Direction:
-    """Return the direction from which a grasp is seen well, or two whose hands are apart: square to
-    their distance.
+    """Return the direction to the viewer from which the grasps of a row are seen well.
+
+    Two hands that are apart are seen from across the line between them.
     """
     poses = [taken.grasps.obj_from_hand[index, :2, 3] for taken, index in row]
     x, y = (poses[0] - poses[-1]).tolist()
@@ -160,8 +169,9 @@ def eye_of(row: list[tuple[Taken, int]]) -> Direction:
 
 
 def draw(taken: Taken, index: int, eye: Direction) -> Image.Image:
-    """Draw one grasp with its contacts, their normals and their virtual frame on the estimated
-    surface.
+    """Return a picture of grasp `index` on the estimated surface, seen from the direction `eye`.
+
+    It shows the hand, the contacts' normals, and the virtual frame of the contacts.
     """
     hand = taken.hand
     grasp = taken.grasps[index]

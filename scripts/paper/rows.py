@@ -69,13 +69,17 @@ class TableSpec(Value):
             check_whole(name, getattr(self, name), 1, 1_000_000)
 
     def kept(self, kind: str, name: str, *asked: object) -> Path:
-        """Return the file, without its ending, in which something of this campaign is kept."""
+        """Return the path, without its ending, of a file that keeps a result of this campaign.
+
+        `kind` is its folder and `name` the beginning of its name. A hash of `asked`, of the starts
+        and of the seed follows.
+        """
         key = seed_of(self.seed, repr((self.starts, *asked)))
         return self.out / kind / f"{name}_{key:016x}"
 
 
 class Subject(NamedTuple):
-    """An object: its folder, None for the library's own, its name, family and group."""
+    """An object of a campaign: its folder (None for the library's own), name, family and group."""
 
     folder: Path | None
     name: str
@@ -84,17 +88,17 @@ class Subject(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Return a name that no other object has."""
+        """The name of the object in results; "own NAME" for the library's own objects."""
         return f"own {self.name}" if self.folder is None else self.name
 
 
 @dataclasses.dataclass(frozen=True)
 class Lift(Value):
-    """One lift, of the grasp at a `rank`, under one `draw` of the object's pose.
+    """One lift of an object by the grasp at a `rank`, under one `draw` of the object's pose.
 
-    `pushed` [m] is how far the object moved until all fingers touched, `slip` [m] in the hand from
-    then on. `certain` tells whether the finger on the most certain contact touched first. NaN,
-    None: never measured.
+    `pushed` [m] is how far the object moved until all fingers touched. `slip` [m] is how far it
+    moved in the hand from then on. `certain` tells whether the finger on the most certain contact
+    touched first. NaN and None mean that it was never measured.
     """
 
     view: str
@@ -107,13 +111,13 @@ class Lift(Value):
 
     @property
     def held(self) -> bool:
-        """Tell whether the object was held."""
+        """Whether the object was lifted and held."""
         return self.status is Status.OK
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell(Value):
-    """The lifts of one object with one hand in one row.
+    """The lifts of one object with one hand, in one row of a table.
 
     `refused` views had no executable grasp; `note` may say why.
     """
@@ -129,5 +133,5 @@ class Cell(Value):
 
     @property
     def held(self) -> int:
-        """Count the lifts that held."""
+        """The number of lifts in which the object was held."""
         return sum(lift.held for lift in self.lifts)

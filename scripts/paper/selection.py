@@ -37,8 +37,10 @@ def bic_curve(
 
 @dataclasses.dataclass(frozen=True)
 class CrossValidation(Value):
-    """Held-out mean log-likelihood [nats] and mean absolute error [rad] for each number of
-    components and fold.
+    """Results of a cross-validation of mixtures with k numbers of components, over f folds.
+
+    `log_likelihood` (k, f) [nats] and `error` (k, f) [rad] are means over the held-out fold: of the
+    log-likelihood, and of the absolute error of the joints.
     """
 
     components: Int[Tensor, "k"]

@@ -16,7 +16,11 @@ Tile = tuple[int, int]
 
 
 def render_tile(canvas: Canvas, corners: np.ndarray, eye: Direction, tile: Tile) -> Image.Image:
-    """Return the picture of a canvas with the height of a tile, cut at its sides."""
+    """Return the picture of a canvas in the size `tile`, (width, height) [pixels].
+
+    It is scaled to the tile's height and cut at its sides. `corners` (n, 3) [m] must be in it, and
+    `eye` is the direction to the viewer.
+    """
     picture = Image.open(io.BytesIO(canvas.render_png(corners, eye)))
     width = round(picture.width * tile[1] / picture.height)
     left = (width - tile[0]) // 2
@@ -31,9 +35,9 @@ def save_sheet(
     captions: dict[tuple[int, int], str],
     most_std_mm: float | None = None,
 ) -> None:
-    """Write rows of pictures, with captions by row and column, and print the path.
+    """Write rows of pictures as one image, with captions by (row, column), and print the path.
 
-    `most_std_mm` adds a bar of the standard deviation.
+    `most_std_mm` is the end [mm] of a colour bar of the standard deviation; None means no bar.
     """
     wide, high = rows[0][0].size if rows else (1, 1)
     top, bottom = (30, 80) if most_std_mm else (0, 0)

@@ -73,7 +73,7 @@ def table3(out: Path, seed: int = 0) -> None:
 
 
 def sample_whole(mesh: trimesh.Trimesh, seed: int) -> PointCloud:
-    """Return points of the whole surface [m] with outward normals."""
+    """Return random points [m] of the whole surface of a mesh with its outward normals, a cloud."""
     points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=seed)[:2]
     return PointCloud(
         torch.from_numpy(np.array(points)), torch.from_numpy(np.array(mesh.face_normals[faces]))
@@ -81,7 +81,10 @@ def sample_whole(mesh: trimesh.Trimesh, seed: int) -> PointCloud:
 
 
 def condition_again(shape: ShapeGP) -> object:
-    """Return the posterior of as many observations at the same places, made at once."""
+    """Return the posterior of a shape's observations, computed anew at once; its time is measured.
+
+    The observations are at the same places as those of the shape.
+    """
     on = shape.x[shape.has_normal]
     normals = shape.predict(shape.metres(shape.x[shape.has_normal])).normal
     off = shape.x[~shape.has_normal]

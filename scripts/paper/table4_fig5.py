@@ -83,8 +83,10 @@ def table4(out: Path, starts: int = 1000, seed: int = 0) -> None:
 
 
 def count(shape: ShapeGP, spec: ContactSpec, starts: int, seed: int) -> dict[str, float]:
-    """Plan and return how many certified grasps came of it, the time of a start [ms], and their
-    quality [cm].
+    """Plan contacts on a shape, and return numbers of the certified grasps by name.
+
+    They are the number of grasps and the CPU time of a start [ms]. Then follow the mean and spread
+    of their quality [cm], and the mean probability of closure.
     """
     began = time.process_time()
     plan = plan_contacts(shape, spec, starts, seed)
@@ -103,7 +105,7 @@ def count(shape: ShapeGP, spec: ContactSpec, starts: int, seed: int) -> dict[str
 
 
 def line(row: dict[str, Any]) -> str:
-    """Return one line of the table; the paper has the first threshold alone."""
+    """Return a row of Table 4 as a line of text; the paper's numbers are at the first threshold."""
     name, grasps, seconds, quality = PUBLISHED[row["object"]]
     beside = f"{name} {grasps}, {seconds} s, {quality}" if row["threshold"] == THRESHOLDS[0] else ""
     measured = f"{row['quality']:.3f} +- {row['spread']:.3f}"
@@ -150,7 +152,10 @@ def fig5(out: Path, starts: int = 300, seed: int = 0) -> None:
 
 
 def unlike(contacts: Contacts, count: int) -> Contacts:
-    """Return grasps whose contacts are far from each other's, whichever finger takes them."""
+    """Return `count` grasps whose contact sets are far from each other.
+
+    The distance of two sets is that of Hausdorff, whichever finger takes a contact.
+    """
 
     def hausdorff(places: Tensor, one: Tensor) -> Tensor:
         apart = torch.cdist(places, one.expand_as(places))
@@ -160,7 +165,10 @@ def unlike(contacts: Contacts, count: int) -> Contacts:
 
 
 def draw(surface: Surface, contacts: Contacts, most: float) -> Image.Image:
-    """Draw a grasp on the surface, from where most of its contacts face the eye."""
+    """Return a picture of the first contact set on a surface coloured by its standard deviation.
+
+    The colours end at `most` [mm]. The viewer stands where most of the contacts face.
+    """
     vertices = surface.vertices.numpy()
     normals = surface.normals.numpy()
     points = contacts.points[0].numpy()

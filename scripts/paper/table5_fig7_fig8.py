@@ -57,7 +57,10 @@ Touching = Literal["rolled", "middle", "uniform"]
 
 @dataclasses.dataclass(frozen=True)
 class Errors:
-    """Test postures, the model's predictions from their codes, and the absolute errors [rad]."""
+    """Test postures of a hand, the model's predictions from their contact codes, and the errors.
+
+    `joints`, `predicted` and `error` are (n, h) [rad]; the errors are absolute.
+    """
 
     hand: Hand
     joints: Float[Tensor, "n h"]
@@ -65,13 +68,20 @@ class Errors:
     error: Float[Tensor, "n h"]
 
     def cases(self) -> list[int]:
-        """Return the rows of the four cases."""
+        """Return the indices of the postures of Table 5's four cases, at given ranks of the error.
+
+        The ranks are shares of all postures (`CASES`), ordered by the mean error of the joints.
+        """
         order = self.error.mean(1).argsort()
         return [int(order[int(share * (len(order) - 1))]) for share in CASES]
 
 
 def measure_errors(name: str, n: int, seed: int, touching: Touching = "rolled") -> Errors:
-    """Predict the joints of n test postures as a query does; the seed must differ from the model's."""
+    """Predict the joints of n random postures of the hand `name` from their contact codes.
+
+    `touching` says where the contacts are, and `seed` draws the postures. A seed with which the
+    model was trained ends the script.
+    """
     hand = load_hand(name)
     mixture = load_mixture(name)
     if str(seed) == mixture.meta["seed"]:
@@ -86,8 +96,9 @@ def measure_errors(name: str, n: int, seed: int, touching: Touching = "rolled") 
 
 
 def nearest_code_error(name: str, n: int, seed: int) -> float:
-    """Return the mean absolute error [rad] of the median posture of the nearest codes: what a code
-    leaves open.
+    """Return the mean absolute error [rad] that contact codes leave open.
+
+    It is the error of the median of those postures whose codes are nearest to the given one.
     """
     hand = load_hand(name)
     known = sample_configurations(hand, n, seed + 1, sampling="grasping")
@@ -197,7 +208,7 @@ def fig8(out: Path, n: int = 100_000, seed: int = 1) -> None:
 
 
 def draw_both(hand: Hand, true: Float[Tensor, "h"], predicted: Float[Tensor, "h"]) -> Image.Image:
-    """Draw a hand at its true joints and, transparent, at the predicted ones."""
+    """Return a picture of a hand at its true joints [rad] and, transparent, at the predicted."""
     canvas = Canvas()
     corners = []
     for joints, transparent in ((true, False), (predicted, True)):

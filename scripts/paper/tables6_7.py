@@ -107,7 +107,10 @@ def table7(spec: Asked) -> None:
 
 
 def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
-    """Print what was held of each object and hand as it is there, and return the cells row by row."""
+    """Print the lifts that held of each object and hand as they come, and return the cells by row.
+
+    `cells` yields for each object and hand its cells in all rows.
+    """
     rows: list[list[Cell]] = []
     for found in cells:
         if not rows:
@@ -127,7 +130,10 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
 
 
 def report(rows: Sequence[Sequence[Cell]]) -> dict[str, Any]:
-    """Print what is to be said of each row, of all hands and of each, and return it."""
+    """Print the results of each row of a table, of all hands and of each; return those of all.
+
+    They are shares that held, medians of motions, and causes of losses, by the row's name.
+    """
     numbers = {row[0].row: _numbers(row) for row in rows}
     lines: list[tuple[str, ...]] = [HEADS]
     for row in rows:
@@ -169,12 +175,12 @@ def _numbers(row: Sequence[Cell]) -> dict[str, Any]:
 
 
 def count_held(row: Sequence[Cell]) -> dict[str, tuple[int, int]]:
-    """Return the lifts that held, and all, of each family."""
+    """Return (lifts that held, all lifts) in a row of a table, by family of objects."""
     return count_by((cell.family, lift.held) for cell in row for lift in cell.lifts)
 
 
 def median(values: Iterator[float]) -> float:
-    """Return the median of the known values; NaN of none.
+    """Return the median of the values that are not NaN; NaN if there are none.
 
     >>> median(iter([3.0, float("nan"), 1.0]))
     2.0
@@ -184,7 +190,9 @@ def median(values: Iterator[float]) -> float:
 
 
 def line_weights(places: Sequence[float]) -> list[float]:
-    """Return the weights of shares that make the fall of the line of least squares through them.
+    """Return the weights by which shares at some places give the fall of their regression line.
+
+    The fall is from the first to the last place.
 
     >>> [round(w, 3) for w in line_weights([1.0, 2.0, 3.0])]
     [1.0, 0.0, -1.0]
@@ -194,7 +202,7 @@ def line_weights(places: Sequence[float]) -> list[float]:
 
 
 def format_points(difference: Share) -> str:
-    """Return a difference of shares in points.
+    """Return a difference of shares as text, in percentage points with its interval.
 
     >>> format_points(Share(0.05, -0.01, 0.11, 80, 40))
     '+5.0 points [-1.0, +11.0] over 40 families'
@@ -208,7 +216,7 @@ def format_points(difference: Share) -> str:
 def write(
     path: Path, spec: TableSpec, rows: Sequence[Sequence[Cell]], found: dict[str, Any]
 ) -> None:
-    """Write what was asked, found and measured as JSON."""
+    """Write a table's settings, results and lifts to a JSON file, and print its path."""
     asked = dataclasses.asdict(spec) | {"out": None, "objects": len(spec.objects)}
     cells = [dataclasses.asdict(cell) for row in rows for cell in row]
     print(write_file(path, format_json({"asked": asked, **found, "cells": cells})))

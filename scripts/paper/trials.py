@@ -47,7 +47,10 @@ CELL_SECONDS = 3600.0
 
 
 def run_cells(spec: TableSpec, rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]]:
-    """Yield for each hand and object the cells of the rows.
+    """Lift each object with each hand in each row of a table; yield the cells of all rows for each
+    hand and object.
+
+    Cells that an earlier call kept are read.
 
     Raises:
         BadArgument: no such objects, or an unknown hand.
@@ -88,7 +91,9 @@ def subjects(spec: TableSpec) -> list[Subject]:
 def fill(
     spec: TableSpec, rows: tuple[Row, ...], subject: Subject, hand_name: str
 ) -> tuple[Cell, ...]:
-    """Return the cells of one object and hand; each is kept as soon as it is there.
+    """Return the cells of one object and hand, one for each row; each is kept once it is done.
+
+    A cell that an earlier call kept is read.
 
     Rows that differ in their names alone share a file.
     """
@@ -115,7 +120,10 @@ def _read_cell(path: Path) -> Cell:
 
 
 class Solid(NamedTuple):
-    """An object: its true mesh, convex parts and mass [kg] if it is known, and noisy views by name."""
+    """The bodies and views of an object: true mesh [m], convex parts [m], and noisy views by name.
+
+    `mass` [kg] is None if it is unknown.
+    """
 
     mesh: "trimesh.Trimesh"
     parts: "Sequence[trimesh.Trimesh]"
@@ -125,7 +133,7 @@ class Solid(NamedTuple):
 
 @functools.lru_cache(maxsize=2)
 def read_solid(subject: Subject) -> Solid:
-    """Return an object of a folder, or the library's own."""
+    """Read mesh, convex parts, mass and views of an object of a folder, or of the library's own."""
     folder, name = subject.folder, subject.name
     if folder is None:
         own = load_object(name)

@@ -29,13 +29,13 @@ VIEWS = {
 
 
 def objects() -> None:
-    """Write mesh, convex parts and noisy view of every object of the library."""
+    """Write mesh, convex parts and noisy view of each shipped object to torchgrasp/data/assets."""
     for name in list_objects():
         write_object(name)
 
 
 def write_object(name: str) -> None:
-    """Write the files of one object."""
+    """Write mesh.ply, parts.npz and view.ply of one shipped object, and print their sizes."""
     from train.object_shapes import author  # needs manifold3d, which the other trainings do not
 
     solid, parts = author(name)

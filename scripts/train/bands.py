@@ -70,10 +70,11 @@ def bands(
 
 
 def fit_factor(ratios: list[np.ndarray]) -> float:
-    """Return the factor with which the shares within 1, 2 and 3 deviations miss least, in the mean
-    over views.
+    """Return the factor of deviations with which errors are best described by a normal law.
 
-    `ratios` are errors over the posterior's own deviations, view by view.
+    The shares of errors within 1, 2 and 3 deviations are then nearest to those of this law. They
+    are means over views. `ratios` are errors over the posterior's own deviations, an array for each
+    view.
     """
     misses = list[float]()
     for factor in FACTORS:
@@ -85,8 +86,10 @@ def fit_factor(ratios: list[np.ndarray]) -> float:
 
 
 def format_shares(rows: Sequence[Row]) -> str:
-    """Return what bands hold with each row's factor, by kind and group, with intervals over
-    families, as a table.
+    """Return a table, as text, of the shares of hidden surface within 1, 2 and 3 deviations.
+
+    Each row's deviations are scaled by its factor. The shares are by kind of shape and group of
+    objects, with intervals over families.
     """
     table: list[tuple[str, ...]] = [HEADS]
     labels = [
@@ -107,7 +110,11 @@ def format_shares(rows: Sequence[Row]) -> str:
 
 
 def measure_ratios(objects: Path, views: Sequence[str] = ()) -> list[Row]:
-    """Return `Row`s of every view, or of those with a name in `views`, with and without the table."""
+    """Return for each view, with and without the table, its errors over the posterior's deviations.
+
+    The errors are those of the estimated shape on hidden surface. `views` are the names of the
+    views; empty means all.
+    """
     rows = []
     for name, _, cloud, mesh in read_views(objects, views):
         hidden = sample_hidden(mesh, cloud, SAMPLES)

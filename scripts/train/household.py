@@ -63,7 +63,7 @@ class HouseholdBody:
 
 
 def author_household(k: int) -> HouseholdBody:
-    """Return the k-th body, always the same; k >= 0.
+    """Return the k-th household body, the same at each call; k counts from 0.
 
     >>> body = author_household(12)
     >>> body.mesh.is_volume and all(part.is_convex for part in body.parts)
@@ -80,12 +80,12 @@ def author_household(k: int) -> HouseholdBody:
 
 
 def family_of(k: int) -> str:
-    """Return the family of the k-th body."""
+    """Return the name of the family of the k-th household body; families take turns."""
     return list(FAMILIES)[k % len(FAMILIES)]
 
 
 def draw_thing(k: int) -> tuple[str, Thing]:
-    """Return the family of the k-th body, and its solids [mm] before it comes to rest."""
+    """Return (family, solids) of the k-th household body, with solids [mm] not yet laid to rest."""
     family = family_of(k)
     draw = np.random.default_rng([SEED, k]).uniform
     thing = FAMILIES[family](draw)

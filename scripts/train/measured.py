@@ -29,10 +29,12 @@ LIMIT = 7200.0
 
 
 class Trials(NamedTuple):
-    """Trials: `features` (n, k), whether each `passed`, its family, rank and hand.
+    """n simulated trials of grasps, with the k features of success (`FEATURES`) of each.
 
-    `beside` (n, m, k) holds the features of all grasps that were tried on the body, for the task of
-    the trial. It is NaN where there are fewer than m. `place` says which of them the trial tried.
+    `features` are (n, k). `passed`, `family`, `rank` and `hand` are (n,): whether the grasp held,
+    the body's family, the grasp's rank and the hand's name. `beside` (n, m, k) holds the features
+    of all grasps that were tried on the same body, for the task of the trial. It is NaN where there
+    are fewer than m. `place` (n,) says which of them the trial tried.
     """
 
     features: Array
@@ -44,12 +46,13 @@ class Trials(NamedTuple):
     place: Array
 
     def select(self, rows: Array) -> "Trials":
-        """Return some of the trials, by a mask."""
+        """Return those of the trials that a mask (n,) or indices choose."""
         return Trials(*(column[rows] for column in self))
 
     def is_best(self, model: SuccessModel) -> Array:
-        """Return a mask of the trials whose grasp has the greatest prediction of those that were
-        tried on its body.
+        """Return a mask (n,) of the trials whose grasp has the greatest predicted success.
+
+        It is the greatest of all grasps that were tried on the same body.
         """
         odds = model.log_odds(torch.from_numpy(self.beside.reshape(-1, len(FEATURES)))).numpy()
         odds = np.where(np.isnan(self.beside[..., 0]), -np.inf, odds.reshape(self.beside.shape[:2]))
@@ -57,10 +60,10 @@ class Trials(NamedTuple):
 
 
 def read_trials(folders: Sequence[Path], workers: int = 1) -> Trials:
-    """Return the trials of data sets of `train.trials`, one for each hand; features of an earlier
-    call are read.
+    """Return all trials of data sets that `scripts/train.py trials` wrote, with their features.
 
-    Of a data set that is not finished, its jobs so far are read.
+    Features that an earlier call kept are read; others are measured in `workers` processes. Of a
+    data set that is not finished, its jobs so far are read.
     """
     missing = [(folder,) for folder in folders if not kept_features(folder).exists()]
     for _ in tqdm(
@@ -72,20 +75,18 @@ def read_trials(folders: Sequence[Path], workers: int = 1) -> Trials:
 
 
 def kept_features(folder: Path) -> Path:
-    """Return the file in a data set that keeps these features of its present trials."""
+    """Return the path of the file in a data set that keeps the features of its present trials."""
     names = *FEATURES, *(path.name for path in list_shards(folder))
     return folder / f"features-{hashlib.sha256(','.join(names).encode()).hexdigest()[:8]}.npz"
 
 
 def list_shards(folder: Path) -> list[Path]:
-    """Return the files of a data set, those of complete shards first."""
+    """Return the paths of a data set's files: first complete shards, then those of single jobs."""
     return [*sorted(folder.glob("*.safetensors")), *sorted((folder / PARTS).glob("*.safetensors"))]
 
 
 def measure_folder(folder: Path) -> None:
-    """Measure the grasps of a data set for the tasks of its trials, and keep the result in its
-    folder.
-    """
+    """Measure the features of all trials of a data set, and write them to a file in its folder."""
     asked = json.loads((folder / ASKED).read_text("utf-8"))["hand"]
     shards = [load_shard(path, {}) for path in list_shards(folder)]
     found = measure_jobs(load_hand(asked["name"], asked["option"]), read_rows(shards))
@@ -95,13 +96,13 @@ def measure_folder(folder: Path) -> None:
 def measure_jobs(
     hand: Hand, jobs: Iterable[tuple[JobRow, PointCloud, Grasps, list[Trial]]]
 ) -> Trials:
-    """Return the trials of jobs of one hand with their features."""
+    """Return the trials, with their features, of jobs of one hand; `read_rows` yields such jobs."""
     columns = [measure_job(hand, cloud, grasps, trials) for _, cloud, grasps, trials in jobs]
     return Trials(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
 def measure_job(hand: Hand, cloud: PointCloud, grasps: Grasps, trials: list[Trial]) -> Trials:
-    """Return the trials of one view of a body with their features."""
+    """Return the trials on one view of a body with their features, measured on the view's shape."""
     body = EstimatedBody.of(fit_shape(cloud, table=0.0))
     n = len(trials)
     beside = np.full((n, BEST + SPREAD, len(FEATURES)), np.nan)

@@ -23,7 +23,7 @@ Vector = Sequence[float | int] | np.ndarray
 
 
 class Solid(NamedTuple):
-    """A convex solid: fine for the mesh, coarse for the convex parts."""
+    """A convex solid twice: `fine` for the mesh, and coarse, as a `part` for a physics engine."""
 
     fine: m3.Manifold
     part: m3.Manifold

@@ -62,8 +62,10 @@ BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 def make_scene(
     meshes: dict[str, trimesh.Trimesh], seed: int
 ) -> tuple[Scene, list[trimesh.Trimesh]]:
-    """Return a rendered scene of 5 to 8 objects in its upright frame, the one nearest the middle
-    its target.
+    """Return (scene, meshes): a rendered scene of 5 to 8 objects, and the objects' true meshes [m].
+
+    Both are in the scene's upright frame. The target is the object nearest to the middle that the
+    camera sees well.
     """
     rng = np.random.default_rng(seed)
     generator = torch.Generator().manual_seed(seed)
@@ -98,7 +100,12 @@ def make_scene(
 def collect(
     meshes: dict[str, trimesh.Trimesh], seeds: range
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return features of hidden places and whether they are full, by kind."""
+    """Return (features, full) of hidden places in rendered scenes, by the kind of place.
+
+    `features` are (n, k), and `full` (n,) tells whether an object other than the target is there.
+    The kinds are "unseen", behind the "target", and behind another "thing". Each seed gives a
+    scene.
+    """
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {kind: [] for kind in KNOTS}
     for seed in seeds:
         scene, things = make_scene(meshes, seed)
@@ -138,8 +145,10 @@ def collect(
 def fit(
     features: np.ndarray, full: np.ndarray, knots: tuple[tuple[float, ...], ...]
 ) -> dict[str, object]:
-    """Return knots, values there and bias of a logistic regression (Newton's method, slightly
-    damped).
+    """Fit the probability that a place is full by logistic regression; return its parameters.
+
+    The log-odds are a bias plus a piecewise linear function of each feature. "knots" and "values"
+    give these functions. `features` are (n, k) and `full` is a mask (n,).
     """
     hats = [
         np.stack([np.interp(x, k, e) for e in np.eye(len(k))], 1)
@@ -159,7 +168,10 @@ def fit(
 
 
 def reliability(p: np.ndarray, full: np.ndarray) -> list[str]:
-    """Return a line for each bin: how many, mean probability, observed share."""
+    """Return a line of text for each bin of probabilities: number, mean and observed share.
+
+    `p` (n,) are the predicted probabilities, and `full` (n,) tells which places are full.
+    """
     which = np.digitize(p, BINS[1:-1])
     rows = [(BINS[i], BINS[i + 1], which == i) for i in range(len(BINS) - 1)]
     return [

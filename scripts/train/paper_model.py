@@ -52,7 +52,11 @@ def paper_model(
 
 
 def even_sizes(samples: HandSamples, count: int) -> HandSamples:
-    """Return `count` of the samples, drawn so that all sizes are about equally likely."""
+    """Return `count` of the sampled postures, drawn so that all sizes are about equally likely.
+
+    The size of a posture is the mean distance [m] of its fingertips from their centre. Sizes
+    outside the limits `SIZES` are left out.
+    """
     size = samples.q[:, :3].mean(1)
     group = (size / STEP).long()
     weight = 1.0 / torch.bincount(group)[group].double()

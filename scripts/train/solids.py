@@ -42,7 +42,7 @@ STEADY = 4.0
 
 
 class Solid(NamedTuple):
-    """A body, and the corners (n, 3) [mm] of each of its convex pieces."""
+    """A solid body [mm], and the corners (n, 3) [mm] of each of its convex pieces."""
 
     body: m3.Manifold
     pieces: list[np.ndarray]
@@ -55,8 +55,9 @@ Families = dict[str, Callable[[Draw], Thing]]
 
 
 def family(families: Families, **sizes: tuple[float, float]) -> Callable[[Callable], Callable]:
-    """Enter a maker into a table under its name. Its sizes are drawn between the given limits, one
-    after another.
+    """Return a decorator that enters a maker of bodies into the table `families` under its name.
+
+    `sizes` are the limits of its arguments; each is drawn between its limits, one after another.
     """
 
     def enter(make: Callable[..., Thing]) -> Callable[..., Thing]:
@@ -71,8 +72,9 @@ def family(families: Families, **sizes: tuple[float, float]) -> Callable[[Callab
 
 
 def stack(profile: Profile, oval: float = 1.0, sides: int = SIDES) -> Thing:
-    """Return a solid of revolution about z, one frustum between two neighbouring points; `oval`
-    scales it along y.
+    """Return a solid of revolution about z, with one frustum between two points of a profile.
+
+    `profile` are pairs of radius and height [mm], from below. `oval` scales the solid along y.
     """
     rings = [disc(r, r * oval, z, sides) for r, z in profile]
     pairs = itertools.pairwise(rings)
@@ -81,8 +83,9 @@ def stack(profile: Profile, oval: float = 1.0, sides: int = SIDES) -> Thing:
 
 
 def disc(a: float, b: float, z: float, sides: int = SIDES) -> np.ndarray:
-    """Return the corners (sides, 3) of an ellipse at height z, with half axes a along x and b along
-    y.
+    """Return the corners (sides, 3) [mm] of an ellipse at height z.
+
+    Its half axes are a along x and b along y.
     """
     # a side, not a corner, is lowest in a lying solid
     angle = 2 * math.pi * (np.arange(sides) + 0.5) / sides
@@ -90,8 +93,10 @@ def disc(a: float, b: float, z: float, sides: int = SIDES) -> np.ndarray:
 
 
 def shell(levels: Sequence[tuple[float, float, float]], oval: float = 1.0) -> Thing:
-    """Return the wall between two profiles about z, of (outer radius, inner radius, height), cut
-    into sectors.
+    """Return a wall about the z axis, whose convex pieces are sectors.
+
+    `levels` are (outer radius, inner radius, height) [mm], from below. `oval` scales the wall along
+    y.
     """
     outer = np.stack([disc(r, r * oval, z, 2 * SECTORS) for r, _, z in levels])
     inner = np.stack([disc(r, r * oval, z, 2 * SECTORS) for _, r, z in levels])
@@ -107,8 +112,9 @@ def shell(levels: Sequence[tuple[float, float, float]], oval: float = 1.0) -> Th
 
 
 def vessel(outline: Profile, wall: float, floor: float, oval: float = 1.0) -> Thing:
-    """Return an open vessel of this outline, with a wall and a floor of these thicknesses [mm].
+    """Return an open vessel about the z axis, with a wall and a floor of these thicknesses [mm].
 
+    `outline` are pairs of outer radius and height [mm], from below. `oval` scales it along y.
     The wall is wider in a level where it leans, so that it is as thick across.
     """
     radius, height = np.array(outline).T
@@ -125,13 +131,13 @@ def vessel(outline: Profile, wall: float, floor: float, oval: float = 1.0) -> Th
 
 
 def box(x: float, y: float, z: float, at: Sequence[float] = (0.0, 0.0, 0.0)) -> Thing:
-    """Return a box of these edges; `at` is the middle of its lowest face."""
+    """Return a box with edges [mm] along x, y and z; `at` [mm] is the middle of its lowest face."""
     corners = np.array(list(itertools.product((-0.5, 0.5), (-0.5, 0.5), (0.0, 1.0))))
     return lump(corners * (x, y, z) + at)
 
 
 def crate(x: float, y: float, z: float, wall: float, floor: float) -> Thing:
-    """Return a box that is open above, with these edges and thicknesses."""
+    """Return a box that is open above, with these edges and thicknesses along x, y and z [mm]."""
     sides = [
         box(x, wall, z, (0, s * (y - wall) / 2, 0)) + box(wall, y, z, (s * (x - wall) / 2, 0, 0))
         for s in (-1, 1)
@@ -144,7 +150,10 @@ def crate(x: float, y: float, z: float, wall: float, floor: float) -> Thing:
 def prism(
     outline: Sequence[tuple[float, float]] | np.ndarray, height: float, top: float = 1.0
 ) -> Thing:
-    """Return a convex outline of (x, y), extruded along z to a top that is scaled by this factor."""
+    """Return a prism: a convex outline of points (x, y) [mm], extruded along z to a `height` [mm].
+
+    The factor `top` scales the outline of its upper face.
+    """
     flat = np.array(outline)
     below = np.c_[flat, np.zeros(len(flat))]
     above = np.c_[top * flat, np.full(len(flat), height)]
@@ -152,8 +161,9 @@ def prism(
 
 
 def slab(x: float, y: float, z: float, corner: float, edge: float) -> Thing:
-    """Return a lying plate with corners of this radius, seen from above, and with edges that are
-    cut by `edge`.
+    """Return a lying plate of the size x, y, z, with rounded corners and cut edges, all in mm.
+
+    `corner` is the radius of its corners seen from above; `edge` is the width of the cut.
     """
     quarter = np.repeat([0, 90, 180, 270], 3)
     rounded = np.radians(quarter + np.tile([0, 45, 90], 4))
@@ -167,13 +177,14 @@ def slab(x: float, y: float, z: float, corner: float, edge: float) -> Thing:
 
 
 def lump(corners: np.ndarray) -> Thing:
-    """Return the hull of corners (n, 3)."""
+    """Return the convex hull of corners (n, 3) [mm] as a thing of one piece."""
     return [Solid(m3.Manifold.hull_points(corners), [corners])]
 
 
 def ball(a: float, b: float, c: float, slices: int = 8) -> Thing:
-    """Return an ellipsoid about the origin with three half axes; its poles are cut flat, so that it
-    rests.
+    """Return an ellipsoid about the origin with half axes a, b and c [mm] along x, y and z.
+
+    Its poles are cut flat, so that it rests. `slices` is the number of its convex pieces.
     """
     cap = 0.18  # angle of the cut [rad]
     angle = np.linspace(math.pi - cap, cap, slices + 1)
@@ -181,7 +192,9 @@ def ball(a: float, b: float, c: float, slices: int = 8) -> Thing:
 
 
 def pebble(a: float, b: float, c: float, at: Sequence[float] = (0.0, 0.0, 0.0)) -> Thing:
-    """Return a coarse ellipsoid about `at` in one piece, for a detail."""
+    """Return a coarse ellipsoid about the point `at` in one convex piece, for a detail; lengths in
+    mm.
+    """
     angle = np.linspace(0.35, math.pi - 0.35, 4)
     rings = [disc(a * math.sin(t), b * math.sin(t), c * math.cos(t), ROUND) for t in angle]
     return lump(np.concatenate(rings) + at)
@@ -190,7 +203,10 @@ def pebble(a: float, b: float, c: float, at: Sequence[float] = (0.0, 0.0, 0.0)) 
 def rod(
     start: Sequence[float], end: Sequence[float], r: float, r_end: float | None = None
 ) -> Thing:
-    """Return a round bar or a frustum between two points."""
+    """Return a round bar of radius r between two points, all in mm.
+
+    If `r_end` is given, the bar is a frustum with this radius at its end.
+    """
     along = np.subtract(end, start)
     side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
     return path(np.array([start, end], float), [r, r if r_end is None else r_end], normal=side)
@@ -204,13 +220,13 @@ def path(
     closed: bool = False,
     sides: int = ROUND,
 ) -> Thing:
-    """Return a bent bar through points (n, 3) of a plane with this normal, one piece between two of
+    """Return a bent bar through points (n, 3) [mm] of a plane, with one convex piece between two of
     them.
 
     Args:
-        points: the middle line.
-        thick: half the thickness in the plane, of the whole bar or at each point.
-        wide: half the width along the normal; by default the thickness.
+        points: points of the middle line.
+        thick: half the thickness [mm] in the plane, of the whole bar or at each point.
+        wide: half the width [mm] along the normal; by default the thickness.
         normal: of the plane.
         closed: the last point is joined to the first.
         sides: of the elliptic section; 4 gives a rectangle.
@@ -232,8 +248,10 @@ def path(
 def arc(
     radius: float | tuple[float, float], start: float, end: float, count: int, at: Sequence[float]
 ) -> np.ndarray:
-    """Return points (count, 3) of a circle or ellipse in the plane of x and z. They lie between two
-    angles [deg] from x to z.
+    """Return points (count, 3) [mm] on an arc of a circle or ellipse in the plane of x and z.
+
+    `radius` is that of the circle, or the half axes of the ellipse. The arc is between two angles
+    [deg], counted from x to z, about the point `at`.
     """
     x, z = radius if isinstance(radius, tuple) else (radius, radius)
     angle = np.radians(np.linspace(start, end, count))
@@ -241,7 +259,7 @@ def arc(
 
 
 def move(thing: Thing, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Thing:
-    """Return the thing, moved."""
+    """Return a copy of the thing, moved by x, y and z [mm]."""
     by = np.array([x, y, z])
     return [
         Solid(body.translate((x, y, z)), [piece + by for piece in pieces]) for body, pieces in thing
@@ -249,8 +267,9 @@ def move(thing: Thing, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Thing:
 
 
 def turn(thing: Thing, axis: str, degrees: float) -> Thing:
-    """Return the thing, turned about an axis through the origin; quarters are exact, so planes stay
-    planes.
+    """Return a copy of the thing, turned about an `axis` ("x", "y" or "z") through the origin.
+
+    Turns by 90 degrees are exact, so that planes stay planes.
     """
     matrix = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     matrix = np.round(matrix) if degrees % 90 == 0 else matrix
@@ -262,27 +281,28 @@ def turn(thing: Thing, axis: str, degrees: float) -> Thing:
 
 
 def lie(thing: Thing) -> Thing:
-    """Return the thing on its side: a quarter of a turn about x."""
+    """Return a copy of the thing on its side: turned by 90 degrees about x."""
     return turn(thing, "x", 90)
 
 
 def tip(draw: Draw, thing: Thing, share: float, degrees: float = 90.0) -> Thing:
-    """Return the thing, turned about x in this share of all cases."""
+    """Return the thing, which is turned by `degrees` about x in a random `share` of all cases."""
     return turn(thing, "x", degrees if draw(0, 1) < share else 0)
 
 
 def around(thing: Thing, count: int, whole: float = 360.0) -> Thing:
-    """Return this many copies of the thing, spread evenly about z over an angle [deg]."""
+    """Return `count` copies of the thing as one, spread evenly about z over an angle [deg]."""
     return join(turn(thing, "z", whole * k / count) for k in range(count))
 
 
 def join(things: Iterable[Thing]) -> Thing:
-    """Return things as one."""
+    """Return several things as one, with the solids of all."""
     return list(itertools.chain.from_iterable(things))
 
 
 def unite(thing: Thing) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:
-    """Return the union of the solids [m], and the hull of each piece.
+    """Return (mesh, parts): the union of a thing's solids, and the hull of each convex piece, in
+    metres.
 
     >>> mesh, parts = unite(box(20, 30, 40) + box(10, 10, 10, at=(0, 0, 40)))
     >>> round(mesh.volume * 1e9), mesh.is_volume, len(parts)
@@ -294,8 +314,9 @@ def unite(thing: Thing) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:
 
 
 def find_rest(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Return the least turn (4 x 4) that lays a body steadily on a face of its hull, or on its
-    steadiest.
+    """Return the least rotation, as a pose (4, 4), that lays a body steadily on a face of its hull.
+
+    If no face is steady, it is the rotation to the steadiest one.
 
     >>> find_rest(trimesh.creation.box((1, 1, 1))).tolist() == np.eye(4).tolist()
     True

@@ -147,21 +147,24 @@ def promise(
 
 
 def read_at_rest(folders: Iterable[Path], workers: int) -> Trials:
-    """Return the trials in which the object was where the planner saw it: no promise is made of
-    others.
+    """Return the trials, of all hands, in which the object was where the planner saw it.
+
+    Promises are made only for such trials.
     """
     tried = read_trials(list_hands(folders), workers)
     return tried.select(tried.features[:, FEATURES.index("displaced")] == 0)
 
 
 def list_hands(folders: Iterable[Path]) -> list[Path]:
-    """Return the data set of each hand in folders of `scripts/train.py trials`."""
+    """Return the folder of each hand's data set in folders that `scripts/train.py trials` wrote."""
     return [folder / hand for folder in folders for hand in HANDS if (folder / hand).exists()]
 
 
 def fit_model(trials: Trials, left: Array) -> SuccessModel:
-    """Return the model, without promises; the mask `left` tells which trials calibrate it and fit
-    no tree.
+    """Return the model of success fitted to trials, without promises.
+
+    The mask `left` (n,) chooses the trials that calibrate the model; its trees are fitted to the
+    others.
     """
     monotonic = [directions().get(name, 0) for name in FEATURES]
     trees = HistGradientBoostingClassifier(**TREES, monotonic_cst=monotonic)
@@ -185,15 +188,16 @@ def fit_model(trials: Trials, left: Array) -> SuccessModel:
 
 
 def keep_trials(model: SuccessModel, tried: Trials) -> torch.Tensor:
-    """Return rows of log-odds, whether the grasp held, and the number of the family."""
+    """Return (log-odds, 1 if the grasp held else 0, number of the family) of each trial, (n, 3)."""
     odds = model.log_odds(torch.from_numpy(tried.features)).numpy()
     family = np.unique(tried.family, return_inverse=True)[1]
     return torch.from_numpy(np.stack([odds, tried.passed, family], -1))
 
 
 def find_range(features: Array) -> Array:
-    """Return least and greatest value of each feature; on the side on which grasps hold better
-    there is no limit.
+    """Return the least and the greatest value of each of k features over trials, (k, 2).
+
+    On the side on which grasps hold better there is no limit.
     """
     found = np.stack([features.min(0), features.max(0)], -1)
     for name, direction in directions().items():
@@ -202,12 +206,15 @@ def find_range(features: Array) -> Array:
 
 
 def directions() -> dict[str, int]:
-    """Return the direction in which the prediction may change with a feature."""
+    """Return 1 for each feature with which the prediction may only rise, -1 where it may only fall.
+
+    Other features are not in the dict.
+    """
     return {name: 1 for name in RISES} | {name: -1 for name in FALLS}
 
 
 def read_trees(trees: HistGradientBoostingClassifier) -> SuccessModel:
-    """Return the trees of scikit-learn as tensors, without calibration."""
+    """Return a model of success with the boosted trees of scikit-learn, without calibration."""
     nodes = [predictor[0].nodes for predictor in trees._predictors]  # pyright: ignore
     shape = len(nodes), max(map(len, nodes))
     feature = np.zeros(shape, dtype=np.int64)
@@ -230,8 +237,10 @@ def read_trees(trees: HistGradientBoostingClassifier) -> SuccessModel:
 
 
 def find_bands(odds: Array, passed: Array, family: Array, seed: int = 0) -> Array:
-    """Return rows of log-odds, and the 95 % interval of the share that held there, from families
-    drawn anew.
+    """Return (log-odds, low, high) of bins of trials: the 95 % interval of the share that held.
+
+    `odds`, `passed` and `family` are those of n trials. The interval is from a bootstrap over
+    families.
     """
     edges = np.quantile(odds, np.linspace(0, 1, KNOTS + 1))
     bins = np.clip(np.searchsorted(edges, odds, side="right") - 1, 0, KNOTS - 1)
@@ -248,7 +257,7 @@ def find_bands(odds: Array, passed: Array, family: Array, seed: int = 0) -> Arra
 
 
 def judge(model: SuccessModel, trials: Trials) -> list[str]:
-    """Return what is to be said of the model's predictions: of all trials, and of each group."""
+    """Return lines of text on how well a model predicts trials: all trials, then each group."""
     p = torch.sigmoid(model.log_odds(torch.from_numpy(trials.features)))
     columns = dict(zip(FEATURES, trials.features.T, strict=True))
     friction = columns["friction"]

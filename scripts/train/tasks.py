@@ -37,7 +37,7 @@ ASIDE = PoseNoise(0.03)
 
 @dataclasses.dataclass(frozen=True)
 class Task(Value):
-    """One trial's task.
+    """The task of one simulated trial of a grasp.
 
     Args:
         lift: whether the object is lifted off a table and held without slip; otherwise it floats
@@ -58,12 +58,15 @@ class Task(Value):
     errs: bool
 
     def pressing(self, force: float) -> "Task":
-        """Return the task with another force [N], unless the hand grips."""
+        """Return the task with another force [N] of the strongest finger, unless the hand grips.
+
+        The hand grips if the task's own force is None.
+        """
         return self if self.force is None else dataclasses.replace(self, force=force)
 
     @property
     def known(self) -> GraspTask:
-        """The task as the planner knows it."""
+        """The task as the planner takes it: mass, force, lift, way to close, and displacement."""
         closing = "open_loop" if self.closing == "open_loop" else "uncertainty"
         return GraspTask(self.mass, self.force, self.lift, closing, self.errs)
 
@@ -89,7 +92,7 @@ class Task(Value):
 
 
 def draw_friction(draw: np.random.Generator) -> float:
-    """Draw a friction, even in its logarithm.
+    """Draw a friction coefficient; its logarithm is uniform between those of the limits `FRICTION`.
 
     >>> FRICTION[0] <= draw_friction(np.random.default_rng(0)) <= FRICTION[1]
     True
@@ -111,8 +114,9 @@ def draw_ordinary(draw: np.random.Generator, planned: float) -> Task:
 
 
 def draw_task(draw: np.random.Generator, planned: float) -> Task:
-    """Draw the task of one trial of a grasp that was planned for the friction `planned`; half keep
-    this friction.
+    """Draw the task of one trial of a grasp that was planned for the friction `planned`.
+
+    Half of all tasks have this friction, the others a random one.
 
     >>> draw_task(np.random.default_rng(0), 0.6) == draw_task(np.random.default_rng(0), 0.6)
     True

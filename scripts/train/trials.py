@@ -91,7 +91,7 @@ Made with {versions}.
 
 
 class Trial(NamedTuple):
-    """One row of the data: a grasp of a body, its rank, its task, and what became of it."""
+    """One trial: a grasp on a body, by its rank from 0, with its task and outcome."""
 
     body: str
     family: str
@@ -102,13 +102,16 @@ class Trial(NamedTuple):
 
 
 class Shelf(NamedTuple):
-    """Some objects of a folder that are tried: the k-th body is each in turn, once for each hand."""
+    """Objects of a folder that are tried in place of household bodies.
+
+    The k-th body is each object in turn, once for each hand.
+    """
 
     folder: Path
     names: tuple[str, ...]
 
     def read(self, k: int) -> HouseholdBody:
-        """Return the k-th body."""
+        """Return the k-th body with its mesh, convex parts [m] and family, read from the folder."""
         name = self.names[k // len(HANDS) % len(self.names)]
         mesh = read_object_mesh(self.folder, name)
         family = read_entry(self.folder, name).family
@@ -219,8 +222,11 @@ def try_body(
     best: bool = False,
     shelf: Shelf | None = None,
 ) -> bytes:
-    """Plan on one view of a body, and try its grasps. Return the bytes of a shard with this job
-    alone.
+    """Plan on one random view of the k-th body, try its grasps, and return the bytes of a shard.
+
+    The shard holds this job alone. `meta` is its metadata, and says which software versions this
+    machine must have. `best` tries the best grasp for ordinary tasks. `shelf` replaces the
+    household bodies.
     """
     check_versions(meta)
     model = load_hand(hand)
@@ -286,9 +292,10 @@ def _try_body(
 
 
 def half_of(cloud: PointCloud, axis: int, far: bool) -> Region:
-    """Return the half of a cloud's bounding box at the far end of an axis, or at the near one.
+    """Return one half of a cloud's bounding box, cut across an axis (0, 1 or 2), as a region.
 
-    It reaches over the unseen side, which is at most as deep as the object is wide.
+    If `far`, it is the half of the greater coordinates. It reaches beyond the box in all other
+    directions, so that it holds the unseen side of the object.
     """
     points = cloud.points.double()
     low = points.amin(0)
@@ -302,13 +309,16 @@ def half_of(cloud: PointCloud, axis: int, far: bool) -> Region:
 
 
 def draw_half(cloud: PointCloud, draw: np.random.Generator) -> Region:
-    """Draw one half of a view's bounding box: the upper one, or one end of a horizontal side."""
+    """Draw one half of a cloud's bounding box as a region: its upper one, or an end in x or y."""
     axis = int(draw.integers(3))
     return half_of(cloud, axis, axis == 2 or draw.random() < 0.5)
 
 
 def best_for(tasks: Sequence[Task], hand: Hand, shape: ShapeGP, grasps: Grasps) -> list[int]:
-    """Return for each task the index of the grasp that most likely holds it."""
+    """Return for each task the index of the grasp with the greatest predicted success.
+
+    Only grasps within the range of the success model count.
+    """
     body = EstimatedBody.of(shape)
     best = list[int]()
     for task in tasks:
@@ -320,8 +330,9 @@ def best_for(tasks: Sequence[Task], hand: Hand, shape: ShapeGP, grasps: Grasps) 
 
 
 def choose_ranks(executable: int, draw: np.random.Generator) -> list[int]:
-    """Return the ranks that are tried: some of the twenty best, and some of the others; at most
-    all.
+    """Draw the ranks of the grasps that are tried, sorted: some of the twenty best, some others.
+
+    There are fewer if there are not enough executable grasps.
 
     >>> choose_ranks(3, np.random.default_rng(0))
     [0, 1, 2]
@@ -333,7 +344,10 @@ def choose_ranks(executable: int, draw: np.random.Generator) -> list[int]:
 
 
 def read_rows(shards: Iterable[Shard]) -> Iterator[tuple[JobRow, PointCloud, Grasps, list[Trial]]]:
-    """Yield each job with grasps: its row, cloud, grasps, and its trials."""
+    """Yield (row, cloud, grasps, trials) of each job of some shards that has grasps.
+
+    A job is one view of one body. Cloud [m] and grasps are in the body's frame.
+    """
     for shard in shards:
         for k, row in enumerate(shard.rows):
             if not row.grasps:

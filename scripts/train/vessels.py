@@ -1,5 +1,7 @@
 """Round and hollow things of a household: solids of revolution, and vessels with thin walls.
 Lengths are in mm.
+
+Each function makes one body of its family. Its table draws the first sizes, `draw` the others.
 """
 
 import math

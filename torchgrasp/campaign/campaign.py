@@ -34,8 +34,8 @@ LONGEST_LICENCE = 100  # letters of a licence's name; those of the SPDX list hav
 @checked
 @dataclasses.dataclass(frozen=True)
 class CampaignSpec(Value):
-    """Options of `run_campaign`: test protocol, views and grasps to try, licence, and size of the
-    files.
+    """Options of `run_campaign`: test protocol, views and grasps to try, licence, size of files,
+    and device.
 
     Args:
         protocol: the protocol by which each grasp is tried in simulation, or its name in

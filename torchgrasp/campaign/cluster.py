@@ -17,9 +17,10 @@ OUTSTANDING = 10_000
 
 
 class OnGpu(NamedTuple):
-    """A task for a Dask worker with the resource "GPU", whose result is an argument of other tasks.
+    """A task for a Dask worker with the resource "GPU": it calls `function` with the arguments
+    `task`.
 
-    The worker calls `function` with the arguments `task`.
+    `run_on_cluster` takes it as an argument of other tasks, which get its result in its place.
     """
 
     function: Callable[..., Any]
@@ -29,16 +30,21 @@ class OnGpu(NamedTuple):
 def run_on_cluster(
     function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], address: str, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
-    """Run tasks on a Dask cluster, and yield the index and the result of each as it ends.
+    """Call `function` for each of `tasks` on a Dask cluster, and yield (index, result) of each task
+    as it ends.
 
-    The result of a task is that of `function`, or a `Status` if it failed. A task holds the
-    arguments of `function`; `address` is that of the scheduler. A task whose worker dies is given
-    to another worker. After too many such deaths the task gives `Status.WORKER_DIED`. The
-    scheduler's setting `distributed.scheduler.allowed-failures`, 3 by default, is their number. A
-    task that takes longer than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. At most
-    10 000 tasks (`OUTSTANDING`) are given to the scheduler at once; they wait there for a free
-    worker. An argument `OnGpu` that successive tasks share is computed once. Without Dask,
-    `MissingExtra` is raised; without a scheduler at the address, `BadArgument`.
+    A task holds the arguments of a call, and its index counts `tasks` from 0. The result is that of
+    `function`, or a `Status` if the worker dies or the call takes too long. An error of `function`
+    is raised here. `address` is that of the scheduler.
+
+    A task whose worker dies is given to another worker. After too many such deaths the task gives
+    `Status.WORKER_DIED`. The scheduler's setting `distributed.scheduler.allowed-failures`, 3 by
+    default, is their number. A task that takes longer than `limit` [s] ends its worker, and gives
+    `Status.TIMED_OUT`. At most 10 000 tasks (`OUTSTANDING`) are given to the scheduler at once;
+    they wait there for a free worker. An argument `OnGpu` that successive tasks share is computed
+    once.
+
+    Raises `MissingExtra` without Dask, and `BadArgument` without a scheduler at the address.
     """
     try:
         from distributed import CancelledError, Client, Event, KilledWorker, as_completed

@@ -35,10 +35,11 @@ and a file or a failure.
 
 
 class Campaign(NamedTuple):
-    """The request of a campaign, and its jobs; a job is one view of one object.
+    """The settings of a campaign, and its jobs; a job is one view of one object.
 
     Attributes:
-        asked: the request, as in `campaign.json`.
+        asked: all settings on which the results depend: hand, protocol, options, versions of
+            packages, and a hash of the objects. `campaign.json` holds them.
         rows: object and view of each job; a job with a status other than OK is not run.
         empty: function that makes the data of a job without grasps, given its row.
     """
@@ -49,13 +50,14 @@ class Campaign(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The content of `campaign.json`."""
+        """The text of `campaign.json`: the settings `asked` as JSON."""
         return format_json(self.asked) + "\n"
 
     @property
     def meta(self) -> dict[str, str]:
-        """The metadata of each shard, a file of the data set: hash of the request, and package
-        versions as JSON.
+        """The metadata of each shard, a file of the data set.
+
+        "campaign" is a hash of all settings, and "versions" are those of packages, as JSON.
         """
         digest = hashlib.sha256(self.text.encode()).hexdigest()
         return {"campaign": digest, "versions": json.dumps(self.asked["versions"])}
@@ -67,13 +69,14 @@ def carry_out(
     work: Work,
     observer: Callable[[JobRow], object] = lambda row: None,
 ) -> GraspShards:
-    """Run the jobs of a campaign that are not yet in its `folder`. Write its data set there, and
+    """Run the jobs of a campaign that are not yet in its `folder`; write the data set there, and
     return it.
 
     `work` is a function that runs jobs, given their indices. As each job ends, it yields a pair.
     First is the job's position among these indices. Second are the bytes of the job's shard file,
-    or a `Status` if it failed. `observer` is called with the `JobRow` of each finished job. Raises
-    `OutputError` if the folder holds another campaign or other files.
+    or a `Status` if it failed. A job with `Status.WORKER_DIED` is run up to three times (`ROUNDS`).
+    `observer` is called with the `JobRow` of each finished job. Raises `OutputError` if the folder
+    holds another campaign or other files.
     """
     with hold_folder(folder):
         begin_folder(folder / ASKED, campaign.text, "campaigns")
@@ -190,10 +193,10 @@ class _Store:
 
 
 def card_of(campaign: Campaign, rows: Sequence[JobRow], digests: list[str]) -> dict[str, Any]:
-    """Return the content of `card.json`, the summary of a campaign's data set.
+    """Return the content of `card.json`, the summary of a campaign's data set, as a dict for JSON.
 
-    `rows` are the outcomes of all jobs, and `digests` the SHA-256 of each shard in hexadecimal
-    digits.
+    It holds the settings, the outcome of each job, and counts of jobs, grasps and trials. `rows`
+    are the outcomes, and `digests` the SHA-256 of each shard in hexadecimal digits.
     """
     asked = campaign.asked
     tries = campaign.asked["protocol"]["noise"]["draws"]

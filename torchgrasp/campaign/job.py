@@ -41,9 +41,9 @@ def versions() -> dict[str, str]:
 
 
 def check_versions(meta: dict[str, str]) -> None:
-    """Raise `BadArgument` unless this machine has the software with which the campaign began.
+    """Raise `BadArgument` unless this machine has the package versions with which a campaign began.
 
-    `meta["versions"]` holds the versions of the packages at the campaign's start, as JSON.
+    `meta["versions"]` holds these versions as JSON, as `versions()` returned them.
     """
     here = json.dumps(versions())
     if here != meta["versions"]:
@@ -51,11 +51,12 @@ def check_versions(meta: dict[str, str]) -> None:
 
 
 def plan_jobs(meta: dict[str, str], *task: Any) -> list[Grasps | None]:
-    """Return the executable grasps of several jobs, those that passed all checks; None for a job
-    that could not be planned.
+    """Plan several jobs at once, and return the executable grasps of each: those that passed all
+    checks.
 
-    `task` holds the arguments of `plan_views`, with one view for each job. `meta["versions"]` holds
-    the software versions at the campaign's start, as JSON. Raises `BadArgument` on a machine with
+    A job is one view of one object. A job that could not be planned has None. `task` holds the
+    arguments of `plan_views`: views, protocol, options and device. `meta["versions"]` holds the
+    software versions at the campaign's start, as JSON. Raises `BadArgument` on a machine with
     others.
     """
     check_versions(meta)
@@ -70,15 +71,17 @@ def run_job(
     plans: object = None,
     place: int = 0,
 ) -> bytes:
-    """Plan and try the grasps of one job, a `view`. Return the bytes of a shard file with only this
+    """Plan grasps on a `view` and try them in simulation; return the bytes of a shard file of this
     job.
 
-    `protocol` is the test of each grasp, and `spec` says which grasps are tried. `meta` holds the
-    `versions` of the software with which the campaign began. Every machine must have them, and the
-    same hand. If `plans` is the list that `plan_jobs` returned, the job's plan is `plans[place]`.
-    If `plans` is None, or the `Status` of a planning that took too long, the job is planned here. A
-    faulty object gives a `JobRow` with the reason. Errors that are not the object's fault are
-    raised.
+    `protocol` is the test of each grasp, and `spec` says which grasps are tried. `meta` is the
+    metadata of the file; its "versions" are those of the software with which the campaign began. If
+    `plans` is the list that `plan_jobs` returned, the job's plan is `plans[place]`. If `plans` is
+    None, or the `Status` of a planning that took too long, the job is planned here.
+
+    A faulty object gives a `JobRow` with the reason; an unexpected error gives `Status.BROKEN`.
+    Raises `BadArgument` on a machine with other versions or another hand. A missing package, a full
+    disk and lack of memory also raise errors.
     """
     check_versions(meta)
     hand = view.load_hand()
@@ -130,9 +133,10 @@ def _work(
 
 
 def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
-    """Return the data (`Shard`) of a job that has neither a cloud nor grasps.
+    """Return the shard (the data) of a single job that has neither a cloud nor grasps.
 
-    `row` is its outcome, and `draws` the number of trials of each grasp in the campaign.
+    `row` is its outcome, `hand` the campaign's hand, and `draws` the number of trials of each grasp
+    in the campaign.
     """
     points = torch.zeros(0, 3, dtype=torch.float64)
     eye = torch.zeros(1, 3, dtype=torch.float64)

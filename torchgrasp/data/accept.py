@@ -70,7 +70,8 @@ def as_cloud(value: Any) -> PointCloud:
 
     The value may be a cloud, a `GraspObject`, a file, or an array or tensor (n, 3) [m]. It may also
     be a cloud of Open3D or trimesh. The name of a shipped object means its view. An array has no
-    viewpoint. Raises `BadArgument` for anything else.
+    viewpoint. `@_named` adds a second argument, the name that errors give to the value. Raises
+    `BadArgument` for anything else, and `CloudFileError` for a malformed file.
     """
     if isinstance(value, PointCloud):
         return value
@@ -97,9 +98,10 @@ def as_cloud(value: Any) -> PointCloud:
 
 @_named
 def as_scene(value: Any) -> Scene:
-    """Return a `Scene`, given a scene or the path of a file of `save_scene`.
+    """Return a `Scene`, given a scene or the path of a file that `save_scene` wrote.
 
-    Raises `BadArgument` for anything else.
+    `@_named` adds a second argument, the name that errors give to the value. Raises `BadArgument`
+    for anything else.
     """
     if isinstance(value, str | Path):
         return read_scene(value)
@@ -110,10 +112,11 @@ def as_scene(value: Any) -> Scene:
 
 @_named
 def as_seen(value: Any) -> PointCloud | Scene:
-    """Return a `Scene`, given a scene or the path of a file of `save_scene`; else the `PointCloud`
-    that `as_cloud` makes of the value.
+    """Return a `Scene` or a `PointCloud` [m], given any value that the library takes for one.
 
-    Raises `BadArgument` for anything else.
+    A scene, or the path of a file that `save_scene` wrote, gives a scene. Any other value is read
+    as a cloud, by `as_cloud`. `@_named` adds a second argument, the name that errors give to the
+    value. Raises `BadArgument` for anything that is neither.
     """
     scene = isinstance(value, Scene) or (isinstance(value, str | Path) and is_scene(Path(value)))
     return as_scene(value, "cloud") if scene else as_cloud(value, "cloud")
@@ -124,7 +127,8 @@ def as_hand(value: Any) -> Hand:
     """Return a `Hand`, given a hand, the name of a shipped hand, or the folder of another hand.
 
     A shipped hand is loaded only once, so that what the planner computes from it is kept for later
-    calls. Raises `BadArgument` for anything else.
+    calls. `@_named` adds a second argument, the name that errors give to the value. Raises
+    `HandFileError` for a name or folder of no hand, and `BadArgument` for anything else.
     """
     if isinstance(value, Hand):
         return value

@@ -44,7 +44,7 @@ SHOWN_NAMES = 100  # most names that an error message quotes
 
 @dataclasses.dataclass(frozen=True)
 class CameraNumbers:
-    """Bounds on the camera positions of `write_objects`."""
+    """Bounds within which `write_objects` draws the camera positions and noise of its views."""
 
     lowest: float = 25.0
     """Least elevation [deg] of a camera above the horizontal, seen from the object."""
@@ -58,8 +58,9 @@ class CameraNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class StandNumbers:
-    """Bounds beyond which a mesh cannot stand on its lowest points as it is oriented in its file.
-    Its foot is the set of its lowest vertices.
+    """Bounds by which a mesh, oriented as in its file, counts as one that stands or falls over.
+
+    The foot of a mesh is the set of its lowest vertices.
     """
 
     foot: float = 0.001
@@ -69,7 +70,7 @@ class StandNumbers:
     over.
     """
     rocks: float = 0.1
-    """Greatest angle [rad] by which a mesh may turn until it stands: scans may rock a little."""
+    """Greatest angle [rad] by which a mesh may tilt before it stands: scans may rock a little."""
     directions: int = 360
     """Number of horizontal directions in which the centre of mass is compared with the foot."""
 
@@ -89,18 +90,19 @@ class ObjectEntry:
     mass: float | None  # mass [kg] of the real object at any scale, or None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
-        """Return at most `most` names of the object's views, sorted; None means all.
+        """Return the names of the object's views, sorted, and of these at most the first `most`.
 
-        With `whole`, the only name is "whole" (`WHOLE`), that of the view that shows all sides.
+        None means all of them. If `whole`, the only name is "whole", that of the view that shows
+        all sides.
         """
         return ([WHOLE] if whole else sorted(self.views))[:most]
 
 
 @checked
 def read_entry(objects: Path | str, name: str) -> ObjectEntry:
-    """Return the description of an object from the manifest of a folder of objects.
+    """Return the description of the object `name` from the manifest of a folder of objects.
 
-    Raises `DatasetError` for a bad or missing manifest, or a bad or missing entry of the object.
+    Raises `DatasetError` if the manifest, or the object's entry in it, is missing or malformed.
     """
     return _parse_entry(name, _read_fields(objects, [name])[name])
 
@@ -109,11 +111,11 @@ def read_entry(objects: Path | str, name: str) -> ObjectEntry:
 def read_entries(
     objects: Path | str, only: Sequence[str] = ()
 ) -> dict[str, ObjectEntry | DatasetError]:
-    """Return the description of each object in a folder of objects, sorted by name. For a bad entry
-    it is the error.
+    """Return the description of each object in a folder of objects, by name, sorted.
 
-    `only` are the names of the objects; empty means all. Raises `DatasetError` for a bad manifest,
-    or one that lacks an object of `only`.
+    An object whose entry in the manifest is malformed has the `DatasetError` in place of its
+    description. `only` are the names of the objects; empty means all. Raises `DatasetError` for a
+    missing or malformed manifest, or one that lacks an object of `only`.
     """
     found: dict[str, ObjectEntry | DatasetError] = {}
     for name, field in sorted(_read_fields(objects, only).items()):
@@ -166,8 +168,8 @@ def write_objects(
         views: number of views of each object.
         seed: seed of the camera directions and of the noise.
 
-    Warns of a mesh that is too large for a hand or falls over (`CloudWarning`), and of bodies that
-    lie apart (`TwoBodies`).
+    Warns of a mesh that is longer than 0.4 m or falls over (`CloudWarning`). Warns also of a mesh
+    whose bodies do not touch each other (`TwoBodies`).
 
     Raises:
         DatasetError: there are no meshes, or two meshes of one name.

@@ -140,7 +140,7 @@ class GraspShards:
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
-        """Return cloud, grasps and trials of a job, one view of one object, in the stored dtype.
+        """Return cloud, grasps and trials of a job, one view of one object, as they are stored.
 
         Args:
             j: index of the job in `jobs`, from 0.
@@ -175,7 +175,10 @@ class GraspShards:
 
 
 def shard_path(folder: Path, k: int) -> Path:
-    """Return the path of the file of the shard with the index `k` in the folder of a data set."""
+    """Return the path of shard `k`, a file of a data set, in the data set's folder.
+
+    `k` counts from 0. The file need not exist.
+    """
     return folder / f"shard-{k:06d}.safetensors"
 
 

@@ -90,7 +90,9 @@ class Records(Value):
 
 
 class Shard(NamedTuple):
-    """The content of a shard file.
+    """The content of a shard, a file of a campaign's data set that holds several jobs.
+
+    A job is one view of one object, with its planned grasps and their trials.
 
     Attributes:
         rows: the outcomes of several jobs.
@@ -101,7 +103,7 @@ class Shard(NamedTuple):
     records: Records
 
     def take(self, i: int) -> "Shard":
-        """Return a shard that holds only the job with the index `i` in `rows`."""
+        """Return a shard that holds only job `i` of this one, counted from 0 in `rows`."""
         row = self.rows[i]
         before = self.rows[:i]
         p = sum(x.points for x in before)
@@ -114,31 +116,34 @@ class Shard(NamedTuple):
 
 
 def shard_ranges(jobs: int, size: int) -> list[range]:
-    """Return the indices of the jobs in each shard, a file of a data set. Each has `size` of the
-    `jobs` jobs, and the last one the rest.
+    """Return the indices of the jobs in each shard, a file of a data set.
+
+    `jobs` is the number of all jobs. Each shard has `size` jobs in order; the last one has the
+    rest.
     """
     return [range(first, min(first + size, jobs)) for first in range(0, jobs, size)]
 
 
 def join_shards(parts: Sequence[Shard]) -> Shard:
-    """Return one shard with the jobs of several shards, in order."""
+    """Return one shard with all jobs of several shards, in the order of `parts`."""
     records = map_tensors(lambda *tensors: torch.cat(tensors), *(part.records for part in parts))
     return Shard(tuple(itertools.chain(*(part.rows for part in parts))), records)
 
 
 def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
-    """Return a shard as the bytes of a safetensors file.
+    """Return the bytes of a safetensors file with the jobs of a shard.
 
-    `meta` is written to the file's metadata; it identifies the campaign.
+    `meta` holds texts by name that identify the campaign; the file has them as metadata.
     """
     jobs = json.dumps([row.as_json() for row in shard.rows])
     return pack_tensors(KIND, named_tensors(shard.records), {**meta, "jobs": jobs})
 
 
 def load_shard(path: Path, meta: dict[str, str]) -> Shard:
-    """Return the content of a shard file.
+    """Return the content of a shard file, which holds jobs of a campaign.
 
-    Raises `ModelFileError` if the file is missing or damaged, or its metadata differ from `meta`.
+    Raises `ModelFileError` if the file is missing or damaged. Raises it also if an entry of `meta`
+    is not in the file's metadata: then the file belongs to another campaign.
     """
     records, found = read_value(path, KIND, Records)
     if (other := {key: found.get(key) for key in meta}) != meta:
@@ -160,9 +165,10 @@ def load_shard(path: Path, meta: dict[str, str]) -> Shard:
 
 
 def read_row(field: Field, bare: bool = False) -> JobRow:
-    """Return the outcome of a job, read from JSON; without metadata if `bare`.
+    """Return the outcome of a job, read from its JSON object `field`.
 
-    Raises the error of `field`, such as `ModelFileError`, for wrong content.
+    If `bare`, the object has no "meta", and the result's `meta` is empty. Wrong content raises the
+    error that `field` was made with, such as `ModelFileError`.
     """
     fields = field.entries(*JobRow._fields[: -1 if bare else None])  # the metadata comes last
     texts = {name: fields[name].text() for name in ("object", "view", "note", "family", "group")}
@@ -179,7 +185,10 @@ def read_row(field: Field, bare: bool = False) -> JobRow:
 
 
 def short(text: str) -> str:
-    """Return a text on one line. It is shortened to the largest length that `read_row` accepts."""
+    """Return a text on one line, cut to 200 characters: `read_row` accepts no more in one field.
+
+    A text that is cut ends with "...".
+    """
     line = one_line(text)
     return line if len(line) <= JSON_LETTERS else f"{line[: JSON_LETTERS - 3]}..."
 
@@ -204,8 +213,11 @@ def load_grasps(path: Path | str) -> Grasps:
 
 
 def check_grasps(path: Path | str, grasps: Grasps) -> None:
-    """Raise `ModelFileError` if grasps from the file `path` hold an invalid pose, status or number
-    of contacts. `Grasps.save` cannot have written such a file.
+    """Raise `ModelFileError` unless grasps, read from the file `path`, can be those of
+    `Grasps.save`.
+
+    They cannot if a pose is not rigid, a status is unknown, or a permutation is none. A grasp has
+    three to five contacts.
     """
     f = grasps.contacts.fingertips
     known = torch.tensor([int(status) for status in Status], device="cpu")

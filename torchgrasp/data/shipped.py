@@ -62,7 +62,7 @@ def list_objects() -> tuple[str, ...]:
 
 
 def find_view(path: Path, name: str = "cloud") -> Path:
-    """Return the path of a cloud, which may be given as the name of a shipped object.
+    """Return the path of the file of a cloud, given this path or the name of a shipped object.
 
     The name gives the path of the object's noisy view; any other path is returned itself. Raises
     `BadArgument` for a word that is neither a file nor a shipped object. `name` is the name of the
@@ -102,11 +102,11 @@ def load_object(name: str) -> GraspObject:
 def solid_of(
     given: "trimesh.Trimesh | Path | str | GraspObject", parts: "Sequence[trimesh.Trimesh] | None"
 ) -> "tuple[trimesh.Trimesh, Sequence[trimesh.Trimesh] | None]":
-    """Return the closed mesh [m] of an object, and its convex parts [m].
+    """Return (mesh, parts): the closed mesh [m] of an object, and its convex parts [m].
 
-    The convex parts are `parts`. If `parts` is None, they are those of the `GraspObject`; for
-    another mesh they are None, unknown. Raises `MeshError` for a mesh that is missing, open or
-    without volume.
+    The convex parts are the argument `parts`. If it is None, they are those of the `GraspObject`
+    that is `given`. For another mesh they are then None, unknown. Raises `MeshError` for a mesh
+    that is missing, open or without volume.
     """
     if isinstance(given, GraspObject):
         return read_mesh(given.mesh), given.parts if parts is None else parts

@@ -26,10 +26,10 @@ def import_arrow() -> Any:
 
 
 def as_column(rows: Tensor) -> Any:
-    """Return a tensor as a column of pyarrow, with one entry for each index of the tensor's first
-    axis.
+    """Return a tensor (n, ...) as a column of a pyarrow table, with n entries.
 
-    An entry is a number. If there are more axes, it is a nested list of numbers of fixed length.
+    An entry is a number if the tensor has one axis. Otherwise it is a nested list of numbers, with
+    the sizes of the other axes.
     """
     arrow = import_arrow()
     column = arrow.array(rows.cpu().reshape(-1).numpy())
@@ -39,17 +39,16 @@ def as_column(rows: Tensor) -> Any:
 
 
 def as_table(columns: Mapping[str, Any], meta: Mapping[str, str]) -> Any:
-    """Return a table of pyarrow, given its columns by name.
+    """Return a pyarrow table, given its columns by name and its metadata `meta`.
 
-    Tensors become columns with an entry for each index of the first axis (`as_column`). `meta`
-    becomes the metadata of the table's schema.
+    A column is whatever pyarrow takes, or a tensor, whose first axis counts the rows of the table.
     """
     cells = {name: as_column(x) if isinstance(x, Tensor) else x for name, x in columns.items()}
     return import_arrow().table(cells).replace_schema_metadata(dict(meta))
 
 
 def pack_table(table: Any) -> bytes:
-    """Return a table of pyarrow as the bytes of a Parquet file."""
+    """Return the bytes of a Parquet file with the content of a pyarrow table."""
     buffer = io.BytesIO()
     # Without dictionaries: hardly any number comes twice.
     import_arrow().parquet.write_table(table, buffer, compression="zstd", use_dictionary=False)
@@ -57,9 +56,10 @@ def pack_table(table: Any) -> bytes:
 
 
 def render_card(template: str, **values: Any) -> str:
-    """Return the text of a card, the description of a data set, from a template and values by name.
+    """Return the text of a card, the description of a data set, made from a Jinja template.
 
-    `template` is a file name in the folder of templates, without ".jinja".
+    `template` is the file's name in `torchgrasp/data/templates`, without ".jinja". `values` are
+    the template's variables by name.
     """
     return render(
         Path(__file__).parent / "templates" / f"{template}.jinja", Status=Status, **values
@@ -69,11 +69,11 @@ def render_card(template: str, **values: Any) -> str:
 def write_folder(
     folder: Path | str, source: Mapping[str, Any], files: Iterable[tuple[str, str | bytes]]
 ) -> Path:
-    """Write files of given names into a folder, one by one; return the folder.
+    """Write files into a folder of their own, one by one; return the folder.
 
-    `files` are pairs of name and content. The file `source.json` gets the content of `source`,
-    which says what the files are made from. Raises `OutputError` if the folder holds other files or
-    cannot be written.
+    `files` are pairs of name and content. `source` says what the files are made from, and is
+    written to `source.json`. Raises `OutputError` if the folder holds other files, or files from
+    another source, or cannot be written.
     """
     folder = Path(folder)
     with hold_folder(folder):

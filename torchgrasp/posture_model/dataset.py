@@ -99,7 +99,7 @@ class SampleFolder:
 
     @checked
     def chunk(self, i: Chunk) -> HandSamples:
-        """Read the postures of chunk i, counted from 0.
+        """Read the postures of chunk i, counted from 0, and their contact codes.
 
         Each chunk has 10,000 postures (`CHUNK_POSTURES`); the last one has the rest.
 
@@ -122,7 +122,7 @@ class SampleFolder:
 
     @checked
     def read(self, n: Count | None = None) -> HandSamples:
-        """Read the first `n` postures into memory; None means all.
+        """Read the first `n` postures and their contact codes into memory; None means all.
 
         Raises `BadArgument` for n outside [1, len(folder)], and `ModelFileError` for a missing or
         damaged chunk.

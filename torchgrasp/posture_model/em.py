@@ -93,7 +93,9 @@ class DataRows:
         return DataRows(rows, torch.distributed.get_rank(), torch.distributed.get_world_size())
 
     def sum(self, x: Tensor) -> Tensor:
-        """Return the sum of the tensor `x` over all processes; every process gets the same bits."""
+        """Return the sum of the tensor `x` over all processes, entry by entry; every process gets
+        the same bits.
+        """
         if self.processes > 1:
             x = x.clone()
             torch.distributed.all_reduce(x)
@@ -161,26 +163,29 @@ class FitProgress(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Fit(FitProgress):
-    """The result of a fit; the last value of `log_likelihood` belongs to the final components.
+    """The result of a fit of m Gaussians by expectation-maximisation (EM).
 
-    `converged`: whether the last step raised the log-likelihood by less than the tolerance.
+    The attributes are those of `FitProgress`, but `log_likelihood` has one value more, that of the
+    final `components`. `converged` says whether the last step raised the log-likelihood by less
+    than the tolerance.
     """
 
     converged: bool = False
 
     def resumed(self) -> FitProgress:
-        """Return the state from which this fit can go on, without the last log-likelihood.
+        """Return the state from which EM can continue this fit.
 
-        The next step computes it again.
+        It lacks the last value of `log_likelihood`, which the next step computes again.
         """
         history = self.log_likelihood[:-1]
         return FitProgress(self.components, self.reseeded, history, self.jumped, self.rows)
 
 
 def likeliest(starts: list[FitProgress], fit: Callable[[FitProgress], Fit]) -> FitProgress:
-    """Fit each of the `starts` by the function `fit`, and return the state of the likeliest fit.
+    """Return the best of several `starts` of EM, after a fit from each by the function `fit`.
 
-    A single start is returned as it is.
+    The result is the final state of the fit whose last log-likelihood is greatest; EM can continue
+    from it. A single start is returned unfitted.
     """
     if len(starts) == 1:
         return starts[0]
@@ -193,11 +198,12 @@ def expectation_maximisation(
     rule: EmRule,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> Fit:
-    """Fit a mixture by EM steps from the state `start`, until `rule` ends them.
+    """Fit a mixture by EM steps from the state `start`, until convergence or the last allowed step.
 
-    `shard` holds the data rows of this process; `observer` is called with the state after each
-    step. Raises `IndefiniteCovariance` for a start with an indefinite covariance. Raises it also if
-    a component collapses more than three times: singular covariance, or too few samples.
+    `rule` gives the tolerance of convergence and the greatest number of steps. `shard` holds the
+    data rows of this process; `observer` is called with the state after each step. Raises
+    `IndefiniteCovariance` for a start with an indefinite covariance. Raises it also if a component
+    collapses more than three times: singular covariance, or too few samples.
     """
     n = shard.count()
     state = start
@@ -216,11 +222,11 @@ def expectation_maximisation(
 def expectation(
     shard: DataRows, components: Components
 ) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
-    """Return (sums, log-likelihood) of all data under m components.
+    """Return the results of an E step of EM: (sums, log-likelihood) of all data under m components.
 
-    The sums are over the data rows x of all processes. What is summed are the f features 1, x_i and
-    x_i x_j of a row. Their weight is each component's responsibility for the row. The
-    log-likelihood [nats] is the total of all rows.
+    `sums` (m, f) are over the data rows x of all processes. What is summed are the f features 1,
+    x_i and x_i x_j (i <= j) of a row. Their weight is each component's responsibility for the row.
+    The log-likelihood [nats] is the total of all rows.
     """
     x = shard.rows
     coefficients = coefficients_from_components(components)
@@ -248,9 +254,10 @@ def expectation(
 def features_from_data(
     x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None = None
 ) -> Float[Tensor, "f n"]:
-    """Return the features [1, x_i, x_i x_j (i <= j)] of each data row x, as a column.
+    """Return the f features [1, x_i, x_i x_j (i <= j)] of each data row x, as a column.
 
-    The data `x` are n rows of d numbers. `out` is a buffer to write into; None makes a new tensor.
+    The data `x` are n rows of d numbers. So f is 1 + d + d (d + 1) / 2. `out` is a buffer to write
+    into; None makes a new tensor.
     """
     n, d = x.shape
     out = x.new_empty(1 + d + d * (d + 1) // 2, n) if out is None else out
@@ -289,13 +296,14 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
 def maximisation(
     sums: Float[Tensor, "m f"], n: int, regularisation: float, reseeded: Int[Tensor, "m"]
 ) -> tuple[Components, Int[Tensor, "m"]]:
-    """Return the maximum-likelihood components, and how often each has collapsed.
+    """Return the results of the M step of EM: the components of greatest likelihood, and how often
+    each has collapsed so far, (m,).
 
     Args:
         sums: sums over all rows of the f features (`features_from_data`), weighted by each
             component's responsibilities.
         n: number of rows.
-        regularisation: added to every variance.
+        regularisation: added to every variance; the variance of the data is 1.
         reseeded: how often each component has collapsed before.
 
     A component in d dimensions collapses if its covariance is singular or it has fewer than d + 1
@@ -344,10 +352,11 @@ def _split_heaviest(components: Components, collapsed: Bool[Tensor, "m"]) -> Com
 
 
 def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: float) -> Components:
-    """Return weights, means and covariances from the weighted sums of the f features
-    (`features_from_data`) of n rows.
+    """Return weights, means and covariances of m components, given weighted sums over n data rows.
 
-    `regularisation` is added to every variance. A component without data gets NaN.
+    `sums` (m, f) are of the f features (`features_from_data`), weighted by each component's
+    responsibilities. `regularisation` is added to every variance. A component without data gets
+    NaN.
     """
     # from the number of features, 1 + d + d (d + 1) / 2
     d = round((math.sqrt(8 * sums.shape[1] + 1) - 3) / 2)
@@ -362,10 +371,11 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
 
 
 def start_components(shard: DataRows, m: int, seed: int, regularisation: float) -> FitProgress:
-    """Return the initial state of a fit: m components from k-means.
+    """Return the initial state of a fit: m Gaussians, one for each cluster that k-means finds in
+    the data of all processes.
 
-    `regularisation` is added to every variance, and `seed` draws the first centres. Raises
-    `BadArgument` for fewer than m distinct rows.
+    `shard` holds the data rows of this process. `regularisation` is added to every variance, and
+    `seed` draws the first centres. Raises `BadArgument` for fewer than m distinct rows.
     """
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)

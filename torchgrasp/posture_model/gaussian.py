@@ -26,10 +26,12 @@ ROUNDING = 1e-6  # greatest error of the weights' sum, and relative asymmetry of
 
 
 class of_parameters(kept[Kept]):
-    """A property of a mixture whose value is cached unless a parameter requires a gradient.
+    """A decorator of methods of a mixture: it makes a property whose value is cached, unless a
+    parameter requires a gradient.
 
-    An optimiser may change such a parameter, so the value is then computed each time. It is also
-    computed anew after a parameter was changed in place, as by an average of an optimiser's steps.
+    The parameters are `weights`, `means` and `covariances`. An optimiser may change one that
+    requires a gradient, so the value is then computed each time. It is also computed anew after a
+    parameter was changed in place, as by an average of an optimiser's steps.
     """
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
@@ -174,10 +176,11 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
-        """Return the marginal mixture over some of the dimensions, in the order of `names`, Eq.
-        (22) of the paper.
+        """Return the marginal mixture over the dimensions called `names`, in this order, Eq. (22)
+        of the paper.
 
-        Raises `BadArgument` for an unknown or repeated name.
+        The other dimensions are integrated out. Raises `BadArgument` for an unknown or repeated
+        name.
         """
         index = self._index(names)
         block = self.covariances.double()[:, index][:, :, index]
@@ -186,10 +189,11 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
-        """Return the mixture over the other dimensions, in the order of `names`, given the values
-        of some of them, Eq. (23) of the paper.
+        """Return the mixture over the remaining dimensions, conditioned on values of the `given`
+        ones, Eq. (23) of the paper.
 
-        Components whose weight becomes 0 are left out, except inside `torch.vmap`.
+        The remaining dimensions keep their order. Components whose weight becomes 0 are left out,
+        except inside `torch.vmap`.
 
         Args:
             given: values of some dimensions, by name, in their units.
@@ -260,8 +264,9 @@ class GaussianMixture(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Whitening:
-    """The m Gaussians of a mixture in whitened form: W (x - mean) is standard normal for a sample x
-    of one. The weights are not included.
+    """The m Gaussians of a mixture in whitened form, without their weights.
+
+    W (x - mean) of a Gaussian is standard normal if x is a sample of this Gaussian.
     """
 
     # lower-triangular matrix W of each Gaussian, with W^T W = covariance^-1
@@ -270,8 +275,10 @@ class Whitening:
     log_scale: Float[Tensor, "m"]  # log-density [nats] of each Gaussian at its mean
 
     def squared(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return the squared Mahalanobis distance (no unit) of each point from the mean of each
-        component.
+        """Return the squared Mahalanobis distances (n, m), without unit, of n points from the means
+        of the m Gaussians.
+
+        The points `x` (n, d) are in the units of the mixture's dimensions.
         """
         m, d = self.means.shape
         whitened = (x @ self.matrix.reshape(m * d, d).T).reshape(-1, m, d) - self.means
@@ -281,10 +288,10 @@ class Whitening:
 def map_rows(
     function: Callable[[Float[Tensor, "n d"]], Tensor], x: Float[Tensor, "*b d"]
 ) -> Tensor:
-    """Return the results of a function at all points x (..., d), computed in float64 in chunks.
+    """Return the values of a function at all points `x` (*b, d), computed in float64 in chunks.
 
-    `function` maps points (n, d) to a tensor with n as first axis. The result has the batch axes
-    and the dtype of `x`.
+    `function` maps points (n, d) to a tensor whose first axis counts the points. In the result the
+    batch axes of `x` replace this axis, and the dtype is that of `x`.
     """
     chunks = x.reshape(-1, x.shape[-1]).double().split(ROWS_PER_CHUNK)
     y = torch.cat([function(rows) for rows in chunks])
@@ -292,9 +299,9 @@ def map_rows(
 
 
 def whitening_matrices(covariances: Float[Tensor, "m d d"]) -> Float[Tensor, "m d d"]:
-    """Return for each covariance the lower-triangular W with W^T W = covariance^-1.
+    """Return the lower-triangular matrix W of each of m covariances, with W^T W = covariance^-1.
 
-    Raises `IndefiniteCovariance` for an indefinite matrix.
+    Raises `IndefiniteCovariance` if a covariance is not positive definite.
     """
     fix = "use fewer components or more samples"
     factor = cholesky(covariances, "a component's covariance", fix)

@@ -47,11 +47,12 @@ WRITTEN = 1e-5  # greatest difference [m, or a cosine] of codes written with sev
 def encode_fingertips(
     points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b q"]:
-    """Return the contact code q = (L, N) of f points [m] with unit normals, Eq. (18).
+    """Return the contact code q = (L, N) of f points [m] with unit normals, Eq. (18) of the paper.
 
-    L_i is the distance [m] of point i from the centroid. N holds the cosines n1.n2, n1.n3, n2.n3
-    and so on of all pairs of normals. No rigid motion changes the code. Fingertips have the same
-    code as the contacts that they touch. Mirror images have this code too: check every match.
+    L_i is the distance [m] of point i from the points' centroid. N holds the cosines n1.n2, n1.n3,
+    n2.n3 and so on of all pairs of normals. So the code has f + f (f - 1) / 2 numbers. No rigid
+    motion changes it. Fingertips with outward normals have the code of the contacts that they
+    touch. Mirror images have this code too: check every match.
     """
     lengths = norm(points - points.mean(-2, keepdim=True))
     pairs = itertools.combinations(normals.unbind(-2), 2)
@@ -108,9 +109,10 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
 
 
 def describe_compatibility(hand: Hand) -> dict[str, str]:
-    """Return metadata that identifies the hand of samples and models.
+    """Return texts by name that identify a hand, for the metadata of its sampled postures and its
+    posture model.
 
-    It holds the hand's name, its grasping fingers, a hash of its files, and the contact codes of
+    They are the hand's name, its grasping fingers, a hash of its files, and the contact codes of
     three postures. The postures depend on the joint limits alone.
     """
     codes = " ".join(f"{x:.7f}" for x in _probe_codes(hand).flatten().tolist())
@@ -123,8 +125,8 @@ def describe_compatibility(hand: Hand) -> dict[str, str]:
 
 
 def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: Hand) -> None:
-    """Raise `BadArgument` for the model of another hand, or of other fingers, joint limits or
-    fingertips.
+    """Raise `BadArgument` unless a posture model belongs to a hand: same joint names, grasping
+    fingers, joint limits and fingertips.
 
     `meta` and `joint_names` are those of the model. Without "hand_codes" in `meta`, only the names
     of the joints are compared.
@@ -379,10 +381,10 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
 
 
 def mixture_path(name_or_path: Path | str) -> Path:
-    """Return the path of a mixture, given by the path of a .safetensors file or by a hand.
+    """Return the path of the file of a posture model, given this path, or a hand's name or folder.
 
     The path of a .safetensors file is returned unchanged. For a hand's name or folder, the result
-    is the path of mixture.safetensors in the hand's folder.
+    is the path of mixture.safetensors in the hand's folder. The file need not exist.
     """
     if Path(name_or_path).suffix == ".safetensors":
         return Path(name_or_path)

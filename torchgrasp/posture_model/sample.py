@@ -35,13 +35,14 @@ BALANCES = 200
 def roll_contacts(
     hand: Hand, joints: Float[Tensor, "n h"], generator: np.random.Generator
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"]]:
-    """Return (points, normals) of random contacts off the centres of the fingertips' pads.
+    """Return (points, normals) of random contacts on the pads of three fingertips, off the pads'
+    centres, in n postures.
 
-    The points [m] and the fingertips' outward unit normals there are in the hand's frame. They are
-    for n postures `joints` [rad or m] of three fingers. `generator` tilts each normal at random
-    from the pad's axis. The tilt has Gaussian components, cut off at the pad's cone. On a round
-    fingertip the contact moves to the point of the sphere with this normal. On a flat pad it stays
-    in place.
+    The points [m] and the fingertips' outward unit normals there are in the hand's frame. `joints`
+    (n, h) [rad or m] are the postures. `generator` tilts each normal at random from the pad's axis.
+    Both components of the tilt are Gaussian, with a deviation of 25 degrees (`ROLL`). The tilt is
+    at most the half angle of the cone of the pad's normals. On a round fingertip the contact moves
+    to the point of the sphere with this normal. On a flat pad it stays in place.
     """
     points, axes = hand.fingertips(joints)
     cone = hand.tips.cone.to(axes)
@@ -58,12 +59,13 @@ def roll_contacts(
 
 
 def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -> Bool[Tensor, "n"]:
-    """Return a mask of the n postures of which some three contacts can have force closure, Eq.
-    (13).
+    """Return a mask (n,) of the postures in which three of the f contacts can have force closure,
+    Eq. (13) of the paper.
 
-    Such contacts can balance forces within their friction cones. The search tries a grid of forces
-    along the triangle's sides and can miss marginal cases. `points` [m] and unit `normals`, which
-    point into the object, are those of the f contacts.
+    Three contacts have it if forces within their friction cones can be in balance. The friction
+    coefficient is the default `ContactSpec().mean_friction`. The search tries a grid of forces
+    along the sides of the contacts' triangle, and can miss marginal cases. `points` [m] are the
+    contacts, and the unit `normals` there point into the object, all in one frame.
     """
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for three in itertools.combinations(range(points.shape[1]), 3):
@@ -165,8 +167,8 @@ class SampleSpec(Value):
 
     @checked
     def meta(self, hand: Hand) -> dict[str, str]:
-        """Return texts by name that identify hand, seed and sampling, but not the number of
-        postures.
+        """Return texts by name that identify a hand and this spec's seed and sampling, but not the
+        number of postures.
         """
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
@@ -222,9 +224,9 @@ def sample_configurations(
 
 
 def chunk_sizes(n: int) -> list[int]:
-    """Return the numbers of postures of the chunks that n postures are split into.
+    """Return the number of postures in each chunk (file) that n postures are split into.
 
-    Each is 10,000 (`CHUNK_POSTURES`); the last is the rest.
+    It is 10,000 (`CHUNK_POSTURES`); the last chunk has the rest.
     """
     return [min(CHUNK_POSTURES, n - first) for first in range(0, n, CHUNK_POSTURES)]
 
@@ -232,10 +234,10 @@ def chunk_sizes(n: int) -> list[int]:
 def draw_chunk(
     hand: Hand, spec: SampleSpec, i: int
 ) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n q"], int]:
-    """Return (joints, codes, drawn) of chunk i: joints [rad or m], contact codes, number of drawn
-    postures.
+    """Draw the n postures of chunk i, counted from 0; return (joints, codes, drawn).
 
-    The n postures of the chunk are those that were kept of all that were drawn; `spec` says which.
+    `joints` (n, h) [rad or m] are the postures that were kept, and `codes` (n, q) their contact
+    codes. `drawn` is the number of postures that were drawn for them. `spec` says which are kept.
     Raises `BadArgument` if less than one in a thousand (`LEAST_KEPT`) is kept.
     """
     count = chunk_sizes(spec.n)[i]

@@ -87,9 +87,11 @@ class MixtureScore(Value):
 
 
 def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScore:
-    """Return how far the joints that a model predicts for contact codes are from the true ones.
+    """Return the errors of the joints that a posture model predicts from contact codes.
 
     `samples` are postures of the same hand, with their codes, that the model was not trained on.
+    Their joints count as the true ones. The result also has the log-likelihood of `samples`, and
+    the share of their codes that the model takes for reachable.
     Raises `BadArgument` for fewer than two postures, or for other joints than the model's.
     """
     if samples.joint_names != mixture.joint_names:
@@ -139,16 +141,18 @@ class BicCurve(Value):
 def growing_bic(
     samples: HandSamples, most: Count = 64, observer: Callable[[int], object] = lambda m: None
 ) -> BicCurve:
-    """Return the BIC of mixtures of 1 to `most` Gaussians (Fig. 6 b, d). Each fit starts from the
-    last.
+    """Return the Bayesian information criterion (BIC) of mixtures of 1 to `most` Gaussians, fitted
+    to `samples` (Fig. 6 b, d of the paper).
 
-    The heaviest Gaussian of a fit is split across its longest axis, and EM continues. The fits take
-    no random number. The criterion belongs to the given postures: more postures support more
-    Gaussians. Codes of "uniform" samples are exact functions of the joints, so the BIC falls
-    without end. For "grasping" samples, whose fingertips roll, the BIC has a minimum. The
-    `observer` is called with each number of Gaussians. Raises `BadArgument` for too few samples,
-    codes not of three fingers, or a joint that does not vary. Raises `IndefiniteCovariance` if a
-    Gaussian collapses more than three times.
+    Each fit starts from the one before. The Gaussian of the greatest weight is split across its
+    longest axis, and EM continues. The fits take no random number. The criterion belongs to the
+    given postures: more postures support more Gaussians. Codes of "uniform" samples are exact
+    functions of the joints, so the BIC falls without end. For "grasping" samples, whose fingertips
+    roll, the BIC has a minimum. The `observer` is called with each number of Gaussians.
+
+    Raises `BadArgument` for too few samples, codes not of three fingers, or a joint that does not
+    vary. Raises `IndefiniteCovariance` if a Gaussian collapses more than three times: its
+    covariance becomes singular, or it has too few samples.
 
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
     >>> growing_bic(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), most=3).components

@@ -62,7 +62,10 @@ class Subsets:
         return Subsets(shard, sizes, own.to(shard.rows.device))
 
     def take(self, size: int) -> DataRows:
-        """Return the rows of this process that belong to the subset of `size` rows."""
+        """Return the rows of this process that belong to the subset of `size` rows.
+
+        `size` is one of `sizes`; it counts the rows of all processes.
+        """
         if self.place is None or size == self.sizes[-1]:
             return self.shard
         return dataclasses.replace(self.shard, rows=self.shard.rows[self.place < size])
@@ -80,11 +83,12 @@ def fit_subsets(
     rule: EmRule,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> Fit:
-    """Fit a mixture by EM to the subsets of the given `sizes`, one after another.
+    """Fit a mixture by EM to the subsets of the given `sizes`, one after another; return the fit to
+    the last one.
 
     `start` is the state before the first step, and `observer` is called with the state after each
-    step. `rule` ends the fit to each subset, and bounds the steps on all subsets together. The last
-    log-likelihood is that of the last subset.
+    step. `rule` says when the fit to a subset ends, and bounds the steps on all subsets together.
+    The last log-likelihood is that of the last subset.
     """
     for size in sizes[:-1]:
         fit = expectation_maximisation(subsets.take(size), start, rule, observer)
@@ -94,11 +98,12 @@ def fit_subsets(
 
 
 def fit_smallest(subsets: Subsets, start: FitProgress, rule: EmRule) -> Fit:
-    """Fit a mixture to the smallest subsets; the fit to all rows can go on from the result.
+    """Fit a mixture by EM to the smallest subsets, one after another; the fit to all rows can go on
+    from the result.
 
-    They have at most eight times (`ENOUGH`) as many rows as the smallest one. If all rows are the
-    only subset, they are used. `start` is the state before the first step, and `rule` ends the fit
-    to each subset.
+    These subsets have at most eight times (`ENOUGH`) as many rows as the smallest one. If all rows
+    are the only subset, they are used. `start` is the state before the first step, and `rule` says
+    when the fit to a subset ends.
     """
     most = ENOUGH * subsets.sizes[0]
     sizes = [size for size in subsets.sizes[:-1] if size <= most] or subsets.sizes
@@ -106,10 +111,11 @@ def fit_smallest(subsets: Subsets, start: FitProgress, rule: EmRule) -> Fit:
 
 
 def growing_fits(shard: DataRows, start: FitProgress, rule: EmRule) -> Iterator[Fit]:
-    """Yield fits to the rows of `shard` without end, each with one component more than the last.
+    """Yield fits by EM to the data of all processes, without end, each with one component more.
 
-    The first begins at `start`. Each later fit starts from the one before, with its heaviest
-    component split. `rule` ends each fit.
+    `shard` holds the data rows of this process. The first fit begins at `start`. Each later fit
+    starts from the one before, with its component of greatest weight split in two. `rule` says when
+    a fit ends.
     """
     n = shard.count()
     while True:

@@ -37,8 +37,8 @@ class MixtureNumbers:
     """Parameters of the fit of a Gaussian mixture to sampled postures."""
 
     trial_steps: int = 20
-    """Number of EM steps of each start before the starts are compared. A whole fit takes some
-    hundred.
+    """Number of EM steps from each of several starts before their likelihoods are compared. A whole
+    fit takes some hundred.
     """
     constant: float = 1e-9
     """Standard deviation of a dimension, over 1 + |mean|, up to which the dimension counts as
@@ -57,7 +57,7 @@ MIXTURES = MixtureNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """The checkpoint file of one fit; a `path` of None means no file.
+    """The checkpoint file of one fit of a mixture, and what identifies this fit.
 
     Process 0 writes the file, all processes read it. `centre` and `scale` identify the data, and
     `settings` the fit.
@@ -70,7 +70,11 @@ class Checkpoint:
     settings: dict[str, str]  # settings of the fit, as texts by name
 
     def save(self, progress: FitProgress) -> None:
-        """Write the state of the fit atomically; raise `OutputError` if that fails."""
+        """Write the state of the fit to the file, atomically; do nothing without a `path` or in a
+        process other than 0.
+
+        Raises `OutputError` if the file cannot be written.
+        """
         if self.path is None or self.shard.rank > 0:
             return
         tensors = {**vars(progress.components), "centre": self.centre, "scale": self.scale}
@@ -79,9 +83,10 @@ class Checkpoint:
         save_tensors(self.path, "em", tensors, meta)
 
     def load(self) -> FitProgress | None:
-        """Return the saved state, or None if there is no file.
+        """Return the state of the fit that the file holds, or None if there is no file.
 
         Raises `ModelFileError` for a damaged file, and `BadArgument` for the file of another fit.
+        `BadArgument` is also raised if some processes see the file and others do not.
         """
         progress = self._read(self.path) if self.path and self.path.exists() else None
         steps = len(progress.log_likelihood) if progress else 0
@@ -251,9 +256,11 @@ def fit_mixture(
 
 
 def information_criterion(components: Components, n: int, log_likelihood: float) -> float:
-    """Return the Bayesian information criterion (BIC) of a fit to n samples; smaller is better.
+    """Return the Bayesian information criterion (BIC) of a mixture fitted to n samples; smaller is
+    better.
 
-    `log_likelihood` [nats] is the mean over the samples, whose dimensions have their own units.
+    Of `components` only the number of parameters counts. `log_likelihood` [nats] is the mean over
+    the samples in their own units, before they were standardised.
     """
     m, d = components.means.shape
     parameters = (m - 1) + m * d + m * d * (d + 1) // 2  # of weights, means and full covariances
@@ -263,11 +270,11 @@ def information_criterion(components: Components, n: int, log_likelihood: float)
 def standardised_rows(
     samples: HandSamples, components: int, distributed: bool = False
 ) -> tuple[DataRows, Float[Tensor, "d"], Float[Tensor, "d"]]:
-    """Return (rows, means, deviations): standardised data, and the original mean and deviation of
-    each dimension.
+    """Return (rows, means, deviations): standardised samples, and the mean and standard deviation
+    of each dimension before.
 
     The rows have mean 0 and variance 1 in each of the d dimensions: the joints [rad or m], then the
-    code. `distributed` says whether `samples` are only the part of this process. Raises
+    contact code. `distributed` says whether `samples` are only the part of this process. Raises
     `BadArgument` for codes not of three fingertips, or for less than d + 2 samples for each of
     `components`. Raises it also for a dimension that does not vary.
     """

@@ -26,20 +26,22 @@ from torchgrasp.sim.decompose import decompose
 
 @dataclasses.dataclass(frozen=True)
 class CutNumbers:
-    """Parameters of the cut of a mesh into convex parts."""
+    """Parameters with which CoACD cuts a mesh into convex parts, and bounds on how far these may
+    bulge.
+    """
 
     thresholds: tuple[float, ...] = (0.05, 0.02, 0.01)
     """Concavities of a part (no unit), as CoACD defines them, below which it cuts no further. They
     are tried in order, until the parts do not bulge out of the mesh.
     """
     bulge: float = 1e-3
-    """Greatest distance [m] of the parts' surface outside the mesh. It is `TrialSpec.overlap`, the
-    depth at which a hand may start in the parts.
+    """Greatest distance [m] of the parts' surface outside the mesh. It equals the default of
+    `TrialSpec.overlap`, the depth by which a hand may penetrate the object at the start.
     """
     within: float = 0.95
     """Share of the parts' surface that must be within the distance `bulge` of the mesh."""
     sampled: int = 2000
-    """Number of points of the parts' surface whose distance is measured."""
+    """Number of points of the parts' surface whose distance outside the mesh is measured."""
 
 
 CUT = CutNumbers()
@@ -55,11 +57,12 @@ _log = logging.getLogger(__name__)
 def convex_parts(
     mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None
 ) -> "list[trimesh.Trimesh]":
-    """Return convex parts [m] whose union approximates a closed mesh; a convex mesh gives a single
-    part.
+    """Return convex parts [m] whose union approximates a closed mesh, in the mesh's frame; a convex
+    mesh gives a single part.
 
     Parts bulge if more than 5 % of their surface lies farther than 1 mm outside the mesh
-    (`CUT.bulge`). The mesh is then cut again, finer, at most twice.
+    (`CUT.bulge`). The mesh is then cut again, finer, at most twice. The parts of the finest cut are
+    returned even if they bulge.
 
     Args:
         mesh: the closed mesh [m], or its file.
@@ -68,8 +71,9 @@ def convex_parts(
             warning is logged.
 
     Raises:
-        MeshError: the mesh is missing, open or without volume, or takes too much time or memory to
-            cut.
+        MeshError: the mesh is missing, open or without volume.
+        MeshError: the coarsest cut takes more than 4 GiB of memory, or 60 s of processor time plus
+            5 ms a face.
         MissingExtra: the mesh is not convex, and CoACD is not installed.
 
     >>> import trimesh
@@ -154,10 +158,11 @@ def _bulge(parts: "Sequence[trimesh.Trimesh]", mesh: "trimesh.Trimesh") -> float
 def read_solid(
     mesh: "trimesh.Trimesh | Path | str", parts: "Sequence[trimesh.Trimesh] | None"
 ) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
-    """Read a closed mesh [m]; return it and its convex parts.
+    """Return (mesh, parts): a closed mesh [m], given or read from its file, and its convex parts.
 
-    These are the given `parts`, or a convex decomposition if they are None. Raises `MeshError` for
-    given parts whose bounding box differs by more than 10 mm from that of the mesh.
+    The convex parts [m] are the given `parts`, or those of `convex_parts` if `parts` is None.
+    Raises `MeshError` for an open mesh, or for given parts that are not convex. Raises it also if
+    the parts' bounding box differs by more than 10 mm from that of the mesh.
     """
     mesh = read_mesh(mesh)
     if parts is None:
@@ -185,9 +190,10 @@ def hull(corners: np.ndarray) -> "trimesh.Trimesh":
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the given convex parts [m] as a list.
+    """Check the convex parts [m] that a caller gave for a mesh, and return them as a list.
 
-    Raises `MeshError` if one is not convex, and for no parts or more than 1000.
+    Raises `MeshError` if a part is not closed or not convex. Raises it also for no parts at all, or
+    for more than 1000.
     """
     if len(parts) > MOST_PARTS:
         raise MeshError("parts", f"{len(parts)} parts", f"at most {MOST_PARTS}")

@@ -32,8 +32,9 @@ def decompose(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the vertices (v, 3) [m] and faces (f, 3) of each convex part of a mesh, cut by CoACD.
 
-    `search` holds CoACD's settings by name. Raises `MissingExtra` without CoACD, and `MeshError`
-    for a mesh that takes too much time or memory.
+    The parts are in the mesh's frame. `search` holds CoACD's settings by name. Raises
+    `MissingExtra` if CoACD is not installed, and `MeshError` if it fails. It also fails beyond
+    4 GiB of memory, or beyond 60 s of processor time plus 5 ms a face.
     """
     from torchgrasp.foundation.errors import MeshError, MissingExtra
 

@@ -22,8 +22,9 @@ NEIGHBOUR = "torchgrasp_neighbour_{}"
 class MujocoScene(SimulatedScene):
     """A simulated scene in MuJoCo: table, object and hand.
 
-    A step runs the second half of MuJoCo's step (forces to state). Then it runs the first half
-    (state to poses and contacts). So poses are current between steps.
+    MuJoCo splits a timestep into `mj_step1` (from state to poses and contacts) and `mj_step2` (from
+    forces to state). A step of this scene runs `mj_step2`, then the next `mj_step1`. So poses and
+    contacts always belong to the present state.
     """
 
     def __init__(self, spec: SceneSpec) -> None:
@@ -82,7 +83,7 @@ class MujocoScene(SimulatedScene):
         self._mujoco.mj_step1(self.model, self.data)
 
     def skip(self, steps: int) -> None:
-        """Advance by `steps` timesteps, without reports of contacts."""
+        """Advance the simulation by `steps` timesteps, without a report of contacts."""
         for _ in range(steps):
             if self._diverged():
                 return
@@ -111,9 +112,10 @@ class MujocoScene(SimulatedScene):
         return [(size, [*impulse, *moment, size, *(sign * x for x in force)])]
 
     def keep(self) -> "Callable[[], MujocoScene]":
-        """Return a function that opens scenes in the present state of this one.
+        """Return a function without arguments; each call returns a new copy of this scene as it is
+        now.
 
-        The scenes share the MuJoCo model of this one.
+        The copies share the MuJoCo model of this scene.
         """
         kept = copy.copy(self.data)
 
@@ -125,15 +127,16 @@ class MujocoScene(SimulatedScene):
         return reopen
 
     def drive(self, targets: np.ndarray) -> None:
-        """Set the position `targets` (j,) [rad or m] of the j driven joints, in the order of
-        `joint_names`.
+        """Set the target positions (j,) [rad or m] of the j driven joints.
+
+        They are in the order of `joint_names`, and hold until the next call.
         """
         self.data.ctrl[self.motors] = targets
 
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
         """Apply a force (3,) [N] at the object's centre of mass and a torque (3,) [N m].
 
-        They are in the world's axes, and act in this and all later steps.
+        Both are in the world's frame, and act in all later steps until the next call.
         """
         self.data.xfrc_applied[self.body] = [*force, *torque]
 
@@ -150,10 +153,11 @@ class MujocoScene(SimulatedScene):
         return self.data.qpos[self._positions]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point on each of the f fingertips with
-        respect to the j driven joints.
+        """Return the Jacobian (f, 3, j) [m/rad] of a point on each fingertip with respect to the j
+        driven joints.
 
-        Jacobian and `points` (f, 3) [m] are in the world's frame.
+        Jacobian and `points` (f, 3) [m] are in the world's frame. Columns of joints that slide have
+        no unit.
         """
         jacobian = np.zeros((len(self.tips), 3, self.model.nv))
         for rows, point, tip in zip(jacobian, points, self.tips, strict=True):
@@ -161,8 +165,8 @@ class MujocoScene(SimulatedScene):
         return jacobian[:, :, self._velocities]
 
     def penetration(self) -> float:
-        """Return the largest depth [m] by which the hand penetrates another body or itself; at most
-        0 if it penetrates nothing.
+        """Return the largest depth [m] by which the hand now penetrates another body or itself; 0
+        if it penetrates nothing.
         """
         deepest = 0.0
         found = self.data.contact
@@ -186,9 +190,9 @@ class MujocoScene(SimulatedScene):
 
 
 def import_mujoco() -> Any:
-    """Import and return MuJoCo, with its warnings counted instead of written to a file.
+    """Import and return the module `mujoco`; its warnings are then counted, not written to a file.
 
-    Raises `MissingExtra` if it is not installed.
+    Raises `MissingExtra` if MuJoCo is not installed.
     """
     try:
         import mujoco
@@ -201,9 +205,10 @@ def import_mujoco() -> Any:
 
 
 def scene_mjcf(spec: SceneSpec) -> str:
-    """Return MuJoCo's XML model of a scene (MJCF), as text.
+    """Return the model of a scene in MJCF, MuJoCo's XML format, as text.
 
-    All joints are at zero, and each has a position servo.
+    All joints are at zero, and each has a position servo. Raises `BadArgument` for a joint without
+    a start position or drive, and `HandFileError` for a malformed URDF.
     """
     spec.check_drives([joint.name for joint in spec.urdf.movable])
     names = [OBJECT, *(NEIGHBOUR.format(k) for k in range(len(spec.neighbours)))]
@@ -215,9 +220,10 @@ def scene_mjcf(spec: SceneSpec) -> str:
 
 
 def render_mjcf(template: str, **values: Any) -> str:
-    """Return a model in MJCF, as text, from a template of this folder filled with `values`.
+    """Return a model in MJCF (MuJoCo's XML format), as text: a Jinja template filled with `values`.
 
-    Numbers are written without loss of precision.
+    `template` is the file's name in `torchgrasp/sim/templates`, without ".jinja". `values` are the
+    template's variables by name. Numbers are written without loss of precision.
     """
     filters = {
         "numbers": format_numbers,
@@ -229,10 +235,11 @@ def render_mjcf(template: str, **values: Any) -> str:
 
 
 def nest_links(urdf: Urdf) -> list[tuple[Link, Joint | None, int]]:
-    """Return (link, joint, ends) for all links from the root down, in the order of nested XML.
+    """Return (link, joint, ends) for each link of a URDF, in depth-first order from the root.
 
-    `joint` moves the link; it is None for the root. `ends` is the number of XML elements to close
-    after the link.
+    In this order, each link's XML element is nested in that of its parent. `joint` connects the
+    link to its parent; it is None for the root. `ends` is the number of XML elements to close after
+    the link.
     """
     links = {link.name: link for link in urdf.links}
     waiting = [(0, urdf.root, None)]
@@ -250,5 +257,7 @@ def nest_links(urdf: Urdf) -> list[tuple[Link, Joint | None, int]]:
 
 
 def format_numbers(numbers: Iterable[float | int]) -> str:
-    """Return numbers as the text of an XML attribute, without loss of precision."""
+    """Return numbers as the text of an XML attribute, separated by spaces, without loss of
+    precision.
+    """
     return " ".join(repr(float(x)) for x in numbers)

@@ -41,7 +41,7 @@ from torchgrasp.sim.scene_spec import (
 
 @dataclasses.dataclass(frozen=True)
 class BodyNumbers:
-    """Settings of PhysX for bodies."""
+    """Settings of PhysX, the engine of SAPIEN, for contacts and for bodies made of convex hulls."""
 
     contact_offset: float = 0.002
     """Distance [m] between two shapes below which PhysX creates their contacts, before they touch.
@@ -62,7 +62,7 @@ BODIES = BodyNumbers()
 
 
 def open_world(gravity: float, timestep: float, patches: bool) -> tuple[Any, Any]:
-    """Return an empty physics system and its scene.
+    """Return (system, scene): an empty PhysX system on the CPU, and the SAPIEN scene that uses it.
 
     `gravity` [m/s^2] is the size of the downward acceleration, and `timestep` is in seconds. If
     `patches` is true, PhysX's solver TGS is selected, which simulates contact patches. Otherwise it
@@ -85,17 +85,18 @@ def open_world(gravity: float, timestep: float, patches: bool) -> tuple[Any, Any
 
 
 def surface_of(friction: float) -> Any:
-    """Return PhysX's material of a surface with a coefficient of `friction`, on which nothing
-    bounces.
+    """Return PhysX's surface material with the friction coefficient `friction`, static and dynamic.
+
+    Its restitution is 0: nothing bounces on it.
     """
     _, physx = import_sapien()
     return physx.PhysxMaterial(friction, friction, 0.0)
 
 
 def place(scene: Any, name: str, body: Any, height: float = 0.0) -> None:
-    """Add an entity called `name` with one body to a SAPIEN scene.
+    """Add a `body` of PhysX to a SAPIEN scene, as an entity called `name`.
 
-    The body's origin is at a `height` [m] on the world's z axis.
+    The body's origin is put at a `height` [m] on the world's z axis; it is not rotated.
     """
     sapien, _ = import_sapien()
     entity = sapien.Entity()
@@ -106,11 +107,11 @@ def place(scene: Any, name: str, body: Any, height: float = 0.0) -> None:
 
 
 def table(material: Any, spec: SceneSpec) -> Any:
-    """Return PhysX's body of the table, of the given `material`. The body's origin lies on the
-    table's surface.
+    """Return PhysX's static body of the table of a scene, with PhysX's surface `material`.
 
-    Without an edge, it is a half space. With an edge (`spec.edge`), it is the surface of a box, in
-    triangles. On a solid box a rocking object would gain energy until it falls over.
+    The body's origin lies on the tabletop, and z is up. If `spec.edge` is None, the body is a half
+    space. Otherwise it is the surface of a box, in triangles. On a solid box a rocking object would
+    gain energy until it falls over.
     """
     sapien, physx = import_sapien()
     body = physx.PhysxRigidStaticComponent()
@@ -136,10 +137,11 @@ def table(material: Any, spec: SceneSpec) -> Any:
 
 
 def rigid_body(material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: float) -> Any:
-    """Return a dynamic body of uniform density, made of convex hulls.
+    """Return PhysX's dynamic body of uniform density, made of convex hulls.
 
-    `spec` gives mass and inertia, and `material` is PhysX's surface material. `hulls` are the
-    vertices (v, 3) [m] of each hull, and `patch` [m] is the radius of contact patches.
+    `spec` gives mass, centre of mass and inertia, and `material` is PhysX's surface material.
+    `hulls` are the vertices (v, 3) [m] of each hull, in the frame of `spec.mesh`. `patch` [m] is
+    the radius of contact patches.
 
     PhysX drops vertices within 0.7 mm of the hull of the others. Therefore this function passes the
     hulls a hundred times as large, with a scale of 1/100.
@@ -177,8 +179,11 @@ def split_hull(hull: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
-    """Load the hand on its mount into a SAPIEN scene. Return its articulation in the initial
-    posture.
+    """Load the hand on its mount into a SAPIEN scene, in the initial posture of `spec`; return
+    SAPIEN's articulation of hand and mount.
+
+    Of PhysX's `material` only the friction coefficients are used. Raises `BadArgument` for a joint
+    without a start position or drive, and `HandFileError` for a malformed URDF.
     """
     loader = scene.create_urdf_loader()
     loader.fix_root_link = True
@@ -214,7 +219,7 @@ def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
 
 
 def import_sapien() -> tuple[Any, Any]:
-    """Import SAPIEN, and return it and its physics module.
+    """Import and return the modules (`sapien`, `sapien.physx`).
 
     SAPIEN's warning about missing Vulkan is hidden, because physics works without Vulkan. Raises
     `MissingExtra` if SAPIEN is not installed.

@@ -33,7 +33,7 @@ def _noted(method: Callable[..., Any]) -> Any:
 
 
 class SapienScene(SimulatedScene):
-    """A simulated scene in SAPIEN: table, object and hand."""
+    """A simulated scene in SAPIEN, whose engine is PhysX: table, object and hand."""
 
     def __init__(self, spec: SceneSpec) -> None:
         super().__init__(spec)
@@ -80,10 +80,11 @@ class SapienScene(SimulatedScene):
         self._tip_index = [self.hand.links.index(tip) for tip in self.tips]
 
     def keep(self) -> "Callable[[], SapienScene]":
-        """Return a function that opens scenes in the present state of this one.
+        """Return a function without arguments; each call returns a new copy of this scene as it is
+        now.
 
-        The function repeats all calls of this scene in a fresh one. PhysX can store the state of
-        its bodies, but not that of its contacts.
+        The function repeats all calls so far in a fresh scene, so it takes as long as they did.
+        PhysX can store the state of its bodies, but not that of its contacts.
         """
         calls = tuple(self._calls)
 
@@ -103,7 +104,7 @@ class SapienScene(SimulatedScene):
         self.system.step()
 
     def skip(self, steps: int) -> None:
-        """Advance by `steps` timesteps, without reports of contacts."""
+        """Advance the simulation by `steps` timesteps, without a report of contacts."""
         for _ in range(steps):
             self._simulate()
 
@@ -129,10 +130,11 @@ class SapienScene(SimulatedScene):
                 yield size, [*(-sign * impulse).tolist(), *(size * point.position).tolist(), size]
 
     def step(self) -> StepContacts:
-        """Advance by one timestep, and return the sums of the hand's contacts during it.
+        """Advance by one timestep; return the impulses [N s], forces [N] and places of the hand's
+        contacts during it, summed for each fingertip.
 
-        The forces are measured at the joints that carry the fingertips. SAPIEN reports contacts
-        without friction, but the complete wrench at each link's joint, in the joint's frame.
+        The forces include friction: they are measured at the joints that carry the fingertips. For
+        contacts, SAPIEN reports no friction, but it reports the complete wrench at each joint.
         """
         contacts = super().step()
         touching = [i for i, weight in enumerate(contacts.weight.tolist()) if weight > 0.0]
@@ -145,16 +147,18 @@ class SapienScene(SimulatedScene):
 
     @_noted
     def drive(self, targets: np.ndarray) -> None:
-        """Set the position `targets` (j,) [rad or m] of the j driven joints, in the order of
-        `joint_names`.
+        """Set the target positions (j,) [rad or m] of the j driven joints.
+
+        They are in the order of `joint_names`, and hold until the next call.
         """
         for joint, target in zip(self._driven, targets.tolist(), strict=True):
             joint.set_drive_target(target)
 
     @_noted
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force (3,) [N] at the object's centre of mass and a torque (3,) [N m]. They are
-        in the world's axes, and act in this and all later steps.
+        """Apply a force (3,) [N] at the object's centre of mass and a torque (3,) [N m].
+
+        Both are in the world's frame, and act in all later steps until the next call.
         """
         self._force = np.asarray(force, np.float32)
         self._torque = np.asarray(torque, np.float32)
@@ -174,10 +178,11 @@ class SapienScene(SimulatedScene):
         return np.asarray(self.hand.get_qpos(), float)[self._places]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point on each of the f fingertips with
-        respect to the j driven joints.
+        """Return the Jacobian (f, 3, j) [m/rad] of a point on each fingertip with respect to the j
+        driven joints.
 
-        Jacobian and `points` (f, 3) [m] are in the world's frame.
+        Jacobian and `points` (f, 3) [m] are in the world's frame. Columns of joints that slide have
+        no unit.
         """
         poses = [link.entity_pose.to_transformation_matrix() for link in self._children]
         frames = np.array(poses, float) @ self._frames
@@ -197,7 +202,8 @@ class SapienScene(SimulatedScene):
         """Return the largest depth [m] by which the hand penetrates another body or itself; at most
         0 if it penetrates nothing.
 
-        It is measured after a step without gravity.
+        This call advances the scene by one timestep, in which object and neighbours feel no
+        gravity. The depth is measured after it.
         """
         bodies = [self.body, *self.neighbours]
         for body in bodies:

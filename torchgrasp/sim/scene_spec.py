@@ -33,7 +33,7 @@ SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z"
 
 @dataclasses.dataclass(frozen=True)
 class SimulationNumbers:
-    """Numbers of a simulated scene and of the mount of its hand."""
+    """Constants of every simulated scene, and of the prismatic joints that carry its hand."""
 
     near: float = 3e-4
     """Height [m] above the table below which a vertex is moved onto the table."""
@@ -227,12 +227,12 @@ class SceneSpec:
 
     @property
     def ledge(self) -> "Ledge":
-        """The table as a box, for a table with an `edge`: a named tuple (centre, half, axes).
+        """The box that stands for a table with an `edge`: a named tuple (centre, half, axes).
 
         `centre` (3,) [m] is its centre in the world's frame, and `half` (3,) [m] half its lengths.
-        The columns of `axes` (3, 3) are its axes: outward beyond the edge, along the edge, and up.
-        The box is under the object. It ends at the edge, or 1 m beyond the object's middle
-        (`SIMULATION.reach`) if the edge is farther.
+        The columns of `axes` (3, 3) are its axes in this frame: outward beyond the edge, along the
+        edge, and up. The box is under the object. It ends at the edge, or 1 m beyond the object's
+        middle (`SIMULATION.reach`) if the edge is farther. Read it only if `edge` is not None.
         """
         assert self.edge is not None
         x, y, offset = self.edge
@@ -279,13 +279,13 @@ class SceneSpec:
 
 
 class Ledge(NamedTuple):
-    """A box that is a table with an edge.
+    """The box that stands for a table with an edge in a simulated scene.
 
     Attributes:
-        centre: its centre (3,) [m] in the world's frame.
-        half: half of its lengths (3,) [m] along its axes.
-        axes: its axes in columns (3, 3): away from the table beyond the edge, along the edge, and
-            up.
+        centre: centre (3,) [m] of the box in the world's frame.
+        half: half of the box's lengths (3,) [m] along its axes.
+        axes: the box's axes (3, 3) in columns, in the world's frame. The first points off the
+            table, the second along the edge, the third up.
     """
 
     centre: np.ndarray
@@ -320,9 +320,11 @@ class Slide(NamedTuple):
 
 
 def edge_of(table: Plane) -> tuple[float, float, float] | None:
-    """Return the edge of a level table as (x, y, offset) in the world's frame; None without an
-    edge. (x, y) is a horizontal unit vector that points off the table, and `offset` [m] the edge's
-    position along it.
+    """Return the edge of a level table as (x, y, offset), for `SceneSpec.edge`; None without an
+    edge.
+
+    (x, y) is a horizontal unit vector that points off the table, and `offset` [m] the edge's
+    position along it. Both are in the frame of `table`, which is the world's.
     """
     if table.edge is None:
         return None
@@ -371,13 +373,13 @@ def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
 
 
 def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[int, int]]:
-    """Return two bit masks for each link in `pairs`, by its name: its own collision group, and the
-    groups that it collides with.
+    """Return (group, mask) for each link in `pairs`, by its name: two bit masks that let only these
+    pairs collide.
 
-    `pairs` are the names of links that are to collide; no other two of these links do. Two links
-    collide if the group of one shares a bit with the mask of the other. PhysX and MuJoCo work so.
-    Only one link of each pair needs its own bit. The bits from number `first` on are used; bit 0 is
-    the lowest. Raises `HandFileError` if 31 bits do not suffice (`SIMULATION.bits`).
+    `pairs` are names of the two links of each pair. In PhysX and MuJoCo, links collide if the group
+    of one shares a bit with the other's mask. Only one link of each pair needs its own bit. The
+    bits from number `first` on are used; bit 0 is the lowest. Raises `HandFileError` if 31 bits do
+    not suffice (`SIMULATION.bits`).
     """
     left = [tuple(pair) for pair in pairs]
     kinds = dict.fromkeys((name for pair in left for name in pair), 0)

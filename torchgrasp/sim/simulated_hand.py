@@ -56,14 +56,14 @@ class SimulatedHand:
 
     Args:
         scene: scene at its initial state, from `open_scene`.
-        reference: the closing plan.
+        reference: the closing plan, which also has the hand and the settings of its sensors.
         control_rate: rate [Hz] of the control ticks; a tick is a whole number of the scene's
             timesteps.
         generator: source of the noise of the fingertips' sensors; None means no noise.
 
     Attributes:
-        truth: the true contacts (`TipContact`) of the last tick, in the frame of the hand's root
-            link.
+        truth: the true contacts of all fingertips in the last tick, as one `TipContact`. They are
+            in the frame of the hand's root link.
         force: true normal forces (f,) [N], averaged over the last tick.
         pushes: full forces (f, 3) [N] of the fingertips on the object, in the world's frame,
             averaged over the last tick.
@@ -76,8 +76,8 @@ class SimulatedHand:
         first_stray: number (3,) of the timestep of the hand's first unintended contact: with a
             neighbour, with the table, with the object. With the object, contacts of fingertips and
             the links that carry them do not count. Infinite before it.
-        stray: sums of the impulses (3,) [N s] of these contacts.
-        most_stray: largest force (3,) [N] of these contacts, averaged over a tick.
+        stray: sums (3,) [N s] of the impulses of these three kinds of contact so far.
+        most_stray: largest force (3,) [N] of each of these kinds so far, averaged over a tick.
         period: time [s] of a control tick.
 
     Raises `BadArgument` if the plan's sensor names an unknown finger as dead.
@@ -164,9 +164,10 @@ class SimulatedHand:
 
     @checked
     def rest(self, ticks: Annotated[int, Range(0, 1000000)]) -> None:
-        """Keep the last targets for a number of control ticks, without measurements.
+        """Simulate a number of control ticks with the last tick's targets, without measurements.
 
-        Raises `BadArgument` for a negative number.
+        Only `steps` counts on; the other attributes stay. Raises `BadArgument` for a negative
+        number.
         """
         self.scene.skip(ticks * self.substeps)
         self.steps += ticks * self.substeps
@@ -174,8 +175,8 @@ class SimulatedHand:
     def unbalanced(self) -> float:
         """Return how far the fingertip forces of the last control tick are from balance, in [0, 1].
 
-        It is the norm of the sum of all forces, divided by the sum of their norms; NaN without
-        forces.
+        It is the norm of the sum of all forces, divided by the sum of their norms. It is NaN if no
+        fingertip exerts a force.
         """
         sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
         return float(np.linalg.norm(self.pushes.sum(0))) / sizes if sizes > 0.0 else math.nan

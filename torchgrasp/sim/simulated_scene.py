@@ -136,7 +136,7 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def skip(self, steps: int) -> None:
-        """Advance by `steps` timesteps, without a report of contacts."""
+        """Advance the simulation by `steps` timesteps, without a report of contacts."""
 
     @abc.abstractmethod
     def _advance(self) -> Iterable[tuple[Any, Any, Any]]:
@@ -155,7 +155,8 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def keep(self) -> "Callable[[], SimulatedScene]":
-        """Return a function that returns copies of this scene in its present state.
+        """Return a function without arguments; each call returns a new copy of this scene as it is
+        now.
 
         Each copy continues with bitwise the same results as this scene. So several pulls can start
         from one closed grasp.
@@ -163,7 +164,7 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def drive(self, targets: np.ndarray) -> None:
-        """Set the targets (j,) [rad or m] of the position control of the j driven joints.
+        """Set the target positions (j,) [rad or m] of the j driven joints.
 
         They are in the order of `joint_names`, and hold until the next call.
         """
@@ -220,7 +221,8 @@ class SimulatedScene(abc.ABC):
 
     @checked
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the target of the lift along the world's z axis, until the next call.
+        """Set the target height and speed of the mount's lift along the world's z axis, until the
+        next call.
 
         A motor of the mount holds the position `height` and the speed `speed` like a spring and a
         damper. A `height` above `SceneSpec.travel` may not be reached.
@@ -234,10 +236,11 @@ class SimulatedScene(abc.ABC):
 
     @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
-        """Set the target of the approach along `SceneSpec.approach`, until the next call.
+        """Set the target of the mount's motion along `SceneSpec.approach`, until the next call.
 
         Args:
-            left: target distance [m] that is left to the end of the approach.
+            left: target distance [m] of the mount from the end of the approach, where the hand is
+                at `SceneSpec.world_from_hand`.
             speed: speed [m/s] at which the target itself moves forward; negative backward. 0 means
                 that the mount comes to rest at `left`.
 
@@ -295,7 +298,7 @@ class SimulatedScene(abc.ABC):
     def hand_pose(self) -> np.ndarray:
         """Return the pose (4, 4) [m] of the hand's root link in the world's frame.
 
-        It is valid after the first step.
+        It is valid only after the first step.
         """
         return self._pose(self.root)
 

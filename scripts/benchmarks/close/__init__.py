@@ -1,1 +1,1 @@
-"""Closing the hand, beside its bars."""
+"""Benches of grasps that a simulated hand closes, lifts or pulls at, each with a target."""

@@ -48,9 +48,11 @@ LIMIT = 600.0
 
 
 class Outcome(NamedTuple):
-    """What came of one body. First where it was grasped ("edge" or "table"), and the number of
-    tries that raised it (0 for none). The same follows for grasps where it lies, and why it was
-    lost.
+    """What came of one low body near a corner of its table.
+
+    `where` says whether the best plan drags it to an "edge" or grasps it on the "table". `tries` is
+    the number of grasps until one raised it, 0 for none. `tries_there` is this number for grasps
+    where it lies. `why` is the status of the last try.
     """
 
     where: str
@@ -99,7 +101,9 @@ def _tried(o: Options, folder: Path, hand: str) -> Row:
 def lift_body(
     folder: Path, name: str, hand_name: str, seed: int, starts: int, simulator: Simulator
 ) -> tuple[str, int, int, str]:
-    """Return the fields of the `Outcome` of a body."""
+    """Plan for a body near a corner, lift it by the best plan and where it lies; return the fields
+    of its `Outcome`.
+    """
     trial = dataclasses.replace(BASE.trial, simulator=simulator)
     hand = load_hand(hand_name)
     mesh = read_object_mesh(folder, name)
@@ -128,27 +132,27 @@ def lift_body(
 
 
 def certain(plan: EdgePlan) -> float:
-    """Return the predicted success of a plan; 0 if it is unknown."""
+    """Return the predicted success of a plan in [0, 1]; 0 if it is unknown."""
     return 0.0 if math.isnan(plan.success) else plan.success
 
 
 def plan_here(cloud: PointCloud, hand: Hand, trial: TrialSpec, starts: int, seed: int) -> EdgePlan:
-    """Return the grasps of a body where it lies, as a plan without a drag."""
+    """Return grasps of a body where it lies, as an `EdgePlan` without a drag."""
     spec = ContactSpec(Distribution.of(trial.friction).mean, table=0.0)
     grasps = plan_grasps(cloud, hand, spec, starts, seed, task=task_of(trial))
     return EdgePlan(None, grasps, fit_shape(cloud, table=Plane.horizontal(0.0)), "it lies there")
 
 
 def task_of(trial: TrialSpec) -> GraspTask:
-    """Return the task: a lift of the trial's mass."""
+    """Return the planner's task that fits a trial: a lift of the trial's mean mass [kg]."""
     return GraspTask(Distribution.of(trial.mass).mean)
 
 
 def corner(bounds: np.ndarray, seed: int) -> list[Plane]:
-    """Return the table with either edge of its corner, which is turned at random.
+    """Return the table z = 0 twice, with one or the other of the two edges of its corner.
 
-    Both edges are at the same distance [m] from the body, whose axis-parallel `bounds` (2, 3) [m]
-    are given.
+    `seed` draws the direction of the corner. Both edges are 0.1 m (`GAP`) from the body's bounding
+    box. `bounds` (2, 3) [m] are the least and the greatest corner of this box.
     """
     turn = float(torch.rand(1, generator=torch.Generator().manual_seed(seed))) * 2 * math.pi
     tables = list[Plane]()
@@ -161,14 +165,17 @@ def corner(bounds: np.ndarray, seed: int) -> list[Plane]:
 
 
 def tries_to_rise(lift: EdgeLift, trial: TrialSpec) -> int:
-    """Return the number of tries if the last one raised the object; else 0."""
+    """Return the number of tries of a lift if the last one raised the object, else 0.
+
+    It is raised if it rose by the share `RAISED` of the trial's height of the lift.
+    """
     if not lift.tries or lift.tries[-1].result.rise < RAISED * trial.lift_height:
         return 0
     return len(lift.tries)
 
 
 def why_lost(lift: EdgeLift) -> str:
-    """Return the status of the last trial."""
+    """Return the status of the last try of a lift; without a try, that of the drag."""
     if lift.tries:
         return lift.tries[-1].result.status.name
     assert lift.drag is not None

@@ -42,10 +42,10 @@ ENOUGH = 100
 
 
 class Cell(NamedTuple):
-    """One plan: object, family, group, hand, friction, mass [kg], executable grasps, and what was
-    tried.
+    """One plan on one object, and the trials of its grasps.
 
-    `tried` holds the rank, the predicted success, and whether the grasp passed.
+    `executable` counts the grasps that passed all checks, and `mass` is in kg. `tried` holds for
+    each trial the grasp's rank from 0, its predicted success, and whether it passed.
     """
 
     object: str
@@ -59,12 +59,15 @@ class Cell(NamedTuple):
 
     @property
     def best(self) -> list[tuple[int, float, bool]]:
-        """The grasps that were tried of the 20 best."""
+        """The trials (rank, predicted success, passed) of the 20 best grasps."""
         return [x for x in self.tried if x[0] < BEST]
 
 
 def table_spec(o: Options, representatives: bool) -> TableSpec:
-    """Return the campaign that some options ask for, of one object of each family or of all."""
+    """Return the settings of a campaign of trials, given the options of a bench.
+
+    If `representatives`, the campaign has one object of each family, else all.
+    """
     return TableSpec(
         o.out,
         o.objects,
@@ -91,7 +94,10 @@ def success(o: Options) -> list[Row]:
 
 
 def judge_tasks(tasks: Sequence[tuple[Any, ...]], workers: int) -> list[Row]:
-    """Return the rows of tasks: the arguments of `try_object`."""
+    """Run tasks in several processes, and return the rows of results of all of them.
+
+    A task holds the arguments of `try_object`.
+    """
     cells = [Cell(*found) for found in run_all(try_object, tasks, workers, CELL_SECONDS)]
     planned = [cell for cell in cells if cell.tried]
     rows = [Row("views with an executable grasp", "-", f"{len(planned)} of {len(cells)}")]
@@ -103,7 +109,11 @@ def judge_tasks(tasks: Sequence[tuple[Any, ...]], workers: int) -> list[Row]:
 def try_object(
     spec: TableSpec, subject: Subject, hand: str, friction: float, mass: float, simulator: str
 ) -> tuple[Any, ...]:
-    """Plan on the first view of an object, and pull at grasps of its plan; a kept result is read."""
+    """Plan on the first view of an object, and pull at grasps of its plan; return the fields of a
+    `Cell`.
+
+    A result that an earlier call kept in a file is read.
+    """
     about = (subject.label, subject.family, subject.group, hand, friction, mass)
     asked = friction, mass, simulator, sha256(MODEL)[:12]
     path = spec.kept("success", f"{hand}_{subject.label}", *asked).with_suffix(".json")
@@ -114,7 +124,11 @@ def try_object(
 def pull_at(
     spec: TableSpec, subject: Subject, hand: str, friction: float, mass: float, simulator: str
 ) -> tuple[int, list[tuple[int, float, bool]]]:
-    """Return the number of executable grasps of a plan, and what became of those that were tried."""
+    """Plan on the first view of an object and pull at its grasps; return (executable, tried).
+
+    `executable` is the number of grasps that passed all checks. `tried` has (rank, predicted
+    success, passed) of each trial: of the 20 best grasps, and of some that follow.
+    """
     base = PROTOCOLS["dexgraspbench"]
     model = load_hand(hand)
     solid = read_solid(subject)
@@ -136,8 +150,10 @@ def pull_at(
 
 
 def judge_predictions(cells: list[Cell]) -> list[Row]:
-    """Return the area under the curve, and the errors of calibration of all trials and of each
-    group.
+    """Return rows that judge the predicted success of grasps.
+
+    They are the calibration error of all trials and of each group, and the areas under the ROC
+    curve. The last row has the share that passed by bins of the prediction.
     """
     groups = {"all": cells, **group_cells(cells)}
     rows = list[Row]()
@@ -161,16 +177,19 @@ def judge_predictions(cells: list[Cell]) -> list[Row]:
 
 
 def judge_trials(trials: Iterable[tuple[str, int, float, bool]]) -> dict[str, Any]:
-    """Return what `score.judge` says of trials: family, rank, prediction, and whether the grasp
-    passed.
+    """Return calibration error, area under the curve and bins of predictions, by `score.judge`.
+
+    A trial is (family, rank, predicted success, passed).
     """
     units, _, predicted, passed = zip(*trials, strict=True)
     return score.judge(torch.tensor(predicted, dtype=torch.float64), torch.tensor(passed), units)
 
 
 def judge_order(cells: list[Cell]) -> list[Row]:
-    """Return how much more often the best grasp passes than the mean of the 20 best. Return also
-    how often by group.
+    """Return rows that judge the order of grasps.
+
+    The first says how much more often the best grasp passes than the mean of the 20 best. For each
+    group follow the shares that passed: of the best grasp, and of one of the best two.
     """
     gains = [
         (c.family, 100 * (c.best[0][2] - sum(x[2] for x in c.best) / len(c.best))) for c in cells
@@ -190,8 +209,10 @@ def judge_order(cells: list[Cell]) -> list[Row]:
 
 
 def judge_promise(cells: list[Cell]) -> list[Row]:
-    """Return how often the best grasp passes where the promise returns it, and how often the
-    promise is refused.
+    """Return rows that judge the promise that a share `SHARE` of the returned grasps holds.
+
+    A plan whose best grasp has too low a prediction is refused. The first row is the share of
+    refused plans. The others are the share of the other plans whose best grasp passed, by group.
     """
     promise = find_promise(SHARE)
     if promise is None:
@@ -208,7 +229,10 @@ def judge_promise(cells: list[Cell]) -> list[Row]:
 
 
 def group_cells(cells: list[Cell]) -> dict[str, list[Cell]]:
-    """Return the plans by group of objects, by friction, by mass and by hand."""
+    """Return the plans in groups by name: by group of objects, by friction, by mass and by hand.
+
+    Each plan is in four of these groups.
+    """
     keys: tuple[Callable[[Cell], str], ...] = (
         lambda cell: cell.group,
         lambda cell: f"friction {cell.friction:g}",
@@ -224,11 +248,11 @@ def group_cells(cells: list[Cell]) -> dict[str, list[Cell]]:
 
 
 def share_of(cells: list[Cell], held: Callable[[Cell], bool]) -> Share:
-    """Return the share of plans that held, with its interval over families."""
+    """Return the share of plans for which `held` is true, with its interval over families."""
     return share_over(count_by((cell.family, held(cell)) for cell in cells))
 
 
 def bar_row(what: str, bar: float, found: Share) -> Row:
-    """Return a row for a share of plans."""
+    """Return the row `what` for a share of plans, with its target: at least `bar` percent."""
     met = 100 * found.value >= bar if found.total else None
     return Row(what, f">= {bar:g} %", format_share(found), met)

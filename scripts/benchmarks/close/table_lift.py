@@ -46,7 +46,7 @@ HANDS = {"barrett": 0.92, "leap": 0.95, "shadow": 0.95}
 
 @bench("close/table-lift", objects=True)
 def table_lift(o: Options) -> list[Row]:
-    """Lift every object in each condition, with each hand."""
+    """Lift every object in each condition, with each hand; return a row for each of these pairs."""
     rows = list[Row]()
     for hand, name in itertools.product(map(load_hand, o.hands), o.conditions or BARS):
         changes, least, strict = BARS[name]
@@ -61,8 +61,10 @@ def table_lift(o: Options) -> list[Row]:
 
 
 def lift_objects(o: Options, hand: Hand, protocol: Protocol, simulator: str) -> list[ViewScore]:
-    """Return the scores of the best grasp of each object under a protocol. The grasps are saved
-    ones, or new ones that are then kept.
+    """Lift each object by the best grasp of one view under a protocol, and return a score for each.
+
+    The grasps are those that an earlier call kept in the folder `out`. If there are none, they are
+    planned and kept.
     """
     noise = dataclasses.replace(protocol.noise, draws=o.draws)
     protocol = dataclasses.replace(protocol, noise=noise).with_trial(simulator=simulator)
@@ -80,7 +82,7 @@ def lift_objects(o: Options, hand: Hand, protocol: Protocol, simulator: str) -> 
 
 
 def names_in(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names that a folder of objects has; other folders have the others."""
+    """Return those of some objects' names that a folder of objects has, sorted."""
     return tuple(sorted({*names} & {*read_entries(folder)}))
 
 

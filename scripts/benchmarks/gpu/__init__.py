@@ -1,1 +1,1 @@
-"""Kernels on a GPU beside the CPU."""
+"""Benches of plans of many clouds at once on a GPU, and of what such plans ask of it."""

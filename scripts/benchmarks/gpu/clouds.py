@@ -54,7 +54,7 @@ def plan_clouds(o: Options) -> list[Row]:
 
 
 def see_view(k: int) -> Any:
-    """Return a view of a shipped object with few points, packed, for another process."""
+    """Return view k of the shipped objects with few points (`POINTS`), packed for a process."""
     torch.set_num_threads(1)
     cloud = views(1, k)[0]
     mixed = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(k))
@@ -65,12 +65,18 @@ def see_view(k: int) -> Any:
 def plan_at_once(
     requests: list[Request], objects: list[Objects | Grasps], device: torch.device
 ) -> list[Grasps]:
-    """Return the grasps of objects with known shapes, planned at once on a device."""
+    """Plan grasps of several objects at once on a device, and return those of each request.
+
+    `objects` holds for each request the estimated shapes, or grasps that say why there are none.
+    """
     return list(plan_stacks(requests, iter(objects), device))
 
 
 def measure(what: str, plan: Callable[[], list[Grasps]]) -> tuple[Row, list[Grasps]]:
-    """Return the row of a plan of many clouds, and its grasps."""
+    """Run a plan of many clouds, and return (row, grasps).
+
+    The row `what` has the rate of executable grasps, the time and the memory on the GPU.
+    """
     cuda = torch.cuda.is_available()
     if cuda:
         torch.cuda.reset_peak_memory_stats()
@@ -82,7 +88,10 @@ def measure(what: str, plan: Callable[[], list[Grasps]]) -> tuple[Row, list[Gras
 
 
 def compare(what: str, alone: list[Grasps], together: list[Grasps]) -> Row:
-    """Return the row of a batch: the rows with the same status, and with the same joints and pose."""
+    """Return a row that compares grasps planned for each cloud alone with those planned together.
+
+    It counts the grasps with the same status, and those with the same joints and pose.
+    """
     pairs = [(one, other.to("cpu")) for one, other in zip(alone, together, strict=True)]
     every = sum(len(one) for one, _ in pairs)
     status = sum(
@@ -98,5 +107,5 @@ def compare(what: str, alone: list[Grasps], together: list[Grasps]) -> Row:
 
 
 def numbers(grasps: Grasps) -> Tensor:
-    """Return the status, joints and pose of each grasp in one vector."""
+    """Return for each grasp a vector of status, joints [rad or m] and pose, (n, 1 + h + 16)."""
     return torch.cat([grasps.status[:, None], grasps.joints, grasps.obj_from_hand.flatten(1)], 1)

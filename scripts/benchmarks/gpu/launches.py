@@ -35,7 +35,7 @@ STAGES = {
 
 @bench("gpu/launches")
 def count_launches(o: Options) -> list[Row]:
-    """Count what plans of batches of clouds ask of a GPU for each cloud."""
+    """Count kernel launches, waits and uploads of plans of batches of clouds, for each cloud."""
     hand = load_hand(o.hands[0])
     found = dict[int, Launches]()
     with pretend():  # what a process keeps is made before
@@ -55,15 +55,17 @@ def count_launches(o: Options) -> list[Row]:
 
 
 def views(count: int, first: int = 0) -> list[PointCloud]:
-    """Return views of the shipped objects: first the shipped ones, then from other sides; number 0
-    is of the jug.
+    """Return `count` views of the shipped objects, from number `first` on.
+
+    Number 0 is of the jug. The first views are the shipped ones; then follow views from other
+    sides.
     """
     names = ("jug", *(name for name in OBJECTS if name != "jug"))
     return [see(names[k % len(names)], k // len(names)) for k in range(first, first + count)]
 
 
 def count_plans(hand: Hand, clouds: list[PointCloud], starts: int) -> Launches:
-    """Return the counts of one call that plans grasps on clouds on the pretended device."""
+    """Plan grasps on clouds in one call on the pretended device, and return what was counted."""
     stages = {
         function: stage for stage, functions in STAGES.items() for function in functions.split()
     }
@@ -75,19 +77,22 @@ def count_plans(hand: Hand, clouds: list[PointCloud], starts: int) -> Launches:
 
 
 def say(counts: Iterable[float]) -> str:
-    """Return the numbers of launches, reads and uploads as text."""
+    """Return the numbers of launches, reads and uploads, in this order, as text."""
     return "{:.0f} launches, {:.1f} reads, {:.1f} uploads".format(*counts)
 
 
 def batch_row(size: int, counted: Launches, hand: Hand, starts: int) -> Row:
-    """Return the row of a batch of clouds that are planned at once."""
+    """Return the row of a batch of `size` clouds planned at once: its counts for each cloud."""
     each = {kind: counted.total(kind) / size for kind in KINDS}
     what = f"{size} clouds at once; {hand.name}, {starts} starts; for each cloud"
     return Row(what, "-", say(each.values()), numbers=each)
 
 
 def lines_row(kind: str, lines: list[tuple[Place, int]], size: int) -> Row:
-    """Return the row of the lines of torchgrasp with the most events of a kind."""
+    """Return a row of the lines of torchgrasp with the most events of a kind, such as launches.
+
+    `lines` are pairs of place and number of events; the row divides them by the number of clouds.
+    """
     counts = {str(place): count / size for place, count in lines}
     text = "; ".join(f"{count:.0f} {place}" for place, count in counts.items())
     return Row(f"lines of torchgrasp with the most of: {kind}", "-", text, None, counts)

@@ -1,1 +1,1 @@
-"""What README says, measured at one commit."""
+"""Benches of the numbers that README publishes, all measured at one commit."""

@@ -37,7 +37,9 @@ HIGHEST = 0.016
 
 @bench("headline/lifts", objects=True)
 def lifts(o: Options) -> list[Row]:
-    """Lift each object once in each condition, with up to three grasps of one view."""
+    """Lift each object once with each hand and in each condition, with up to three grasps of one
+    view.
+    """
     o = dataclasses.replace(o, names=o.names or LEFT_OUT, draws=1)
     rows = [_tried(o, hand, "in place", "sapien", {}, bar) for hand, bar in HANDS.items()]
     rows.append(_tried(o, "allegro", "in place", "mujoco", {}, HANDS["allegro"]))
@@ -76,9 +78,10 @@ def _tried(
 def row_of(
     hand: str, condition: str, simulator: str, scores: Sequence[ViewScore], bar: float
 ) -> Row:
-    """Return the shares that rose with up to three grasps, and with the first one alone.
+    """Return the row of one hand in one condition: the shares of objects that rose.
 
-    An object without a grasp counts as lost. Numbers name what was lost, and how.
+    The shares are with up to three grasps, and with the first one alone. `bar` is the target of the
+    former. An object without a grasp counts as lost. `Row.numbers` names what was lost, and how.
     """
     tries = {x.object: [a.tries if a.passed else 0 for a in x.attempts] or [0] for x in scores}
     unit = {x.object: x.unit for x in scores}

@@ -42,7 +42,10 @@ STARTS = 8
 
 
 def write_headline(rows: Sequence[Row], options: Options) -> None:
-    """Write README's table, the page of results, and the plans, of all rows of the bench."""
+    """Write all rows of the headline bench: as README's table and as the page of results.
+
+    Also write the plans that identify how the library planned at this commit.
+    """
     run = describe_run(options.threads)
     about = ABOUT.format(command=command_line(), run=run)
     write_file(PAGE, "\n".join([about, *format_rows(rows)]) + "\n")
@@ -52,7 +55,10 @@ def write_headline(rows: Sequence[Row], options: Options) -> None:
 
 
 def readme_table(rows: Sequence[Row], run: str) -> list[str]:
-    """Return the lines of README's table: lifts by hand, condition and simulator."""
+    """Return the Markdown lines of README's table: lifts by hand, condition and simulator.
+
+    `run` is the text of `describe_run`, which names the commit.
+    """
     commit = run.split(";")[0].removeprefix("Commit ")
     lines = [
         f"Measured at commit {commit} by `scripts/bench.py headline`.",
@@ -77,7 +83,9 @@ def format_percent(share: Share) -> str:
 
 
 def replace_table(text: str, lines: Sequence[str]) -> str:
-    """Return a text in which `lines` stand between the two marks."""
+    """Return README's text with `lines` between its marks `BEGIN` and `END`, in place of what is
+    there.
+    """
     block = "\n".join([BEGIN, "", *lines, "", END])
     pattern = re.compile(re.escape(BEGIN) + ".*?" + re.escape(END), re.DOTALL)
     if not pattern.search(text):
@@ -108,5 +116,5 @@ def _plan(name: str, hand: str) -> dict[str, Any]:
 
 
 def read_plans(path: Path = PLANS) -> dict[str, Any]:
-    """Return the plans of the published table."""
+    """Return the plans of `golden_plans` that were written to a file with the published table."""
     return json.loads(path.read_text("utf-8"))["plans"]

@@ -1,5 +1,5 @@
-"""What it costs to be told where to hold. The best grasp of a free plan stands beside the best one
-with all contacts in a region.
+"""What it costs to plan with all contacts in a given region. The best grasp of such a plan stands
+beside the best one of a free plan.
 
 The region is chosen from the cloud before planning. For every second object it is the upper half of
 the cloud's bounding box. For the others it is the half of its longer horizontal side with fewer
@@ -59,10 +59,11 @@ def region(o: Options) -> list[Row]:
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """What became of one object: its region, and of both plans the executable grasps, verdict and
-    seconds.
+    """What became of one object under two plans: a free one, and one kept to a region.
 
-    `contacts` and `inside` count the contacts of all executable grasps of the kept plan.
+    The lists have two entries, of the free and of the kept plan. They are the number of executable
+    grasps, the status of the best one's closing, and the seconds of the plan. `contacts` counts the
+    contacts of all executable grasps of the kept plan, and `inside` those in the region.
     """
 
     family: str
@@ -74,14 +75,18 @@ class Found:
     inside: int
 
     def held(self, kept: bool) -> bool:
-        """Tell whether the best grasp of the kept or free plan held."""
+        """Tell whether the best grasp held: of the kept plan if `kept`, else of the free one."""
         return self.status[kept] == Status.OK.name
 
 
 def compare(
     spec: TableSpec, subject: Subject, hand: str, upper: bool, simulator: str
 ) -> dict[str, Any]:
-    """Return the fields of `Found` for one object; a kept result is read."""
+    """Plan free and in a region, close both best grasps, and return the fields of `Found`.
+
+    If `upper`, the region is the cloud's upper half, else an end of it. A result that an earlier
+    call wrote to a file is read.
+    """
     path = spec.kept("region", f"{hand}_{subject.label}", upper, simulator).with_suffix(".json")
     return keep(path, lambda: dataclasses.asdict(_compare(spec, subject, hand, upper, simulator)))
 
@@ -124,8 +129,10 @@ def _compare(
 
 
 def choose_half(cloud: PointCloud, upper: bool) -> Region:
-    """Return the upper half of a cloud's bounding box over its table, or half of its length with
-    fewer points.
+    """Return one half of a cloud's bounding box as a region for contacts.
+
+    If `upper`, it is the upper half. Otherwise it is that half of the longer horizontal side which
+    has fewer points.
     """
     if upper:
         return half_of(cloud, 2, far=True)

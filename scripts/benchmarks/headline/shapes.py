@@ -101,14 +101,17 @@ def pace(o: Options) -> list[Row]:
 
 
 def measure_view(folder: Path, name: str) -> dict[str, float]:
-    """Return what `measure_shape` says of the shape of a rendered view."""
+    """Fit a shape to the first rendered view of an object, and return errors of its hidden side.
+
+    The errors are those of `measure_shape`.
+    """
     cloud = read_view(folder, name, "view0")
     return measure_shape(fit_shape(cloud, table=0.0), read_object_mesh(folder, name), cloud)
 
 
 def measure_shape(shape: ShapeGP, mesh: trimesh.Trimesh, cloud: PointCloud) -> dict[str, float]:
-    """Return errors of a shape [m] on the true surface that a cloud does not show. The face on the
-    table is left out.
+    """Return errors of an estimated shape, by name, on the true surface that its cloud does not
+    show. The face on the table is left out.
 
     * "median", "p90": distance [mm] of the true surface from the estimated one.
     * "within_1", "within_2", "within_3": share of the true surface within k std_m. Surface outside
@@ -132,9 +135,11 @@ def measure_shape(shape: ShapeGP, mesh: trimesh.Trimesh, cloud: PointCloud) -> d
 def judge_hidden(
     seen: torch.Tensor, measured: torch.Tensor, table: float = TABLE
 ) -> dict[str, float]:
-    """Return the same for one camera's points (n, 3) [m], judged by `measured` (m, 3) of another.
+    """Return errors of the shape of one camera's points on the surface that another one measured.
 
-    All is NaN if the view is refused.
+    `seen` (n, 3) and `measured` (m, 3) are points [m] in one frame; `table` is the table's height
+    [m]. The errors are those of `measure_shape`, at measured points far from those seen.
+    All is NaN if no shape can be fitted.
     """
     far = torch.from_numpy(KDTree(seen.numpy()).query(measured.numpy())[0]) > UNSEEN
     hidden = measured[far]

@@ -30,8 +30,10 @@ FRICTION = 0.8
 
 @dataclasses.dataclass(frozen=True)
 class Touch:
-    """The contacts of one grasp, and its predicted success. `away` are their distances from what
-    any camera measured, and `std_m` the deviation of the surface there [m].
+    """The f contacts of one grasp on a real view, and its predicted success in [0, 1].
+
+    `away` (f,) [m] are their distances from the nearest point that any camera measured. `std_m`
+    (f,) [m] are the standard deviations of the estimated surface there.
     """
 
     away: Tensor
@@ -40,9 +42,11 @@ class Touch:
 
 
 def contact_row(name: str, clouds: dict[str, dict[str, Tensor]], table: float, o: Options) -> Row:
-    """Return the row of the best grasps of a hand, planned on each view alone.
+    """Return the row that judges the contacts of the best grasps of a hand, planned on each view
+    alone.
 
-    `clouds` holds the points (n, 3) [m] of each thing by camera, on a `table` [m].
+    `clouds` holds the points (n, 3) [m] of each thing by camera. `table` is the height [m] of their
+    table.
     """
     hand = load_hand(name)
     found = list[Touch]()
@@ -74,21 +78,22 @@ def contact_row(name: str, clouds: dict[str, dict[str, Tensor]], table: float, o
 
 
 def distance_from(measured: Tensor, points: Tensor) -> Tensor:
-    """Return the distance (n,) of each of the points (n, 3) from the nearest measured one [m]."""
+    """Return the distance (n,) [m] of each of `points` (n, 3) from the nearest measured point."""
     return torch.from_numpy(KDTree(measured.numpy()).query(points.numpy())[0])
 
 
 def tell(touch: Touch) -> str:
-    """Return the contacts of a grasp as text."""
+    """Return the distance and the deviation `std_m` [mm] of each contact of a grasp, as text."""
     pairs = zip(touch.away.tolist(), touch.std_m.tolist(), strict=True)
     text = ", ".join(f"{1e3 * d:.1f} mm (std_m {1e3 * s:.1f})" for d, s in pairs)
     return f"{text} from a measured point"
 
 
 def judge_contacts(what: str, found: list[Touch], refused: int) -> Row:
-    """Return the row of contacts that are near what was measured, or told.
+    """Return the row that judges contacts of grasps: near a measured point, or uncertain.
 
-    A distance is told if `std_m` is half of it or more. `refused` views had no grasp.
+    A contact is near within 5 mm (`NEAR`). A farther one must have a `std_m` of half its distance
+    or more. `refused` counts the views without a grasp.
     """
     distance = torch.cat([touch.away for touch in found])
     deviation = torch.cat([touch.std_m for touch in found])

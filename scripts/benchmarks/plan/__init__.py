@@ -1,1 +1,1 @@
-"""The contact planner, beside its bars."""
+"""Benches of how long a plan takes, each with a target."""

@@ -27,8 +27,11 @@ Numbers = dict[str, float]
 
 
 class Measure(NamedTuple):
-    """A number of the jobs: its name, its text, the statistic of all jobs, and the unit. Last is
-    the most ratio to the other commit; of a rate, the least.
+    """A row of the comparison: one number of the timing jobs, summed up over all jobs.
+
+    `name` is the number's name in the answers of jobs, and `text` says what it is. `statistic` is
+    what is taken over jobs, such as "median". `bar` is the greatest ratio of this code to the
+    other commit; for a rate, the least. None means no target.
     """
 
     name: str
@@ -57,7 +60,7 @@ MEASURES = (
 
 
 class Timer:
-    """A process that times one tree; `run` gives it a job."""
+    """A process that runs timing jobs (timed.py) with the library of one source tree."""
 
     def __init__(self, process: "subprocess.Popen[str]", tree: Path) -> None:
         self.process = process
@@ -66,7 +69,7 @@ class Timer:
             raise SystemExit(f"beside: torchgrasp is of {found}, not of {tree}")
 
     def run(self, job: str, **arguments: Any) -> Numbers:
-        """Return the numbers of a job of timed.py."""
+        """Run a job of timed.py, such as "plan", in the process; return its numbers by name."""
         to: IO[str] = self.process.stdin  # pyright: ignore[reportAssignmentType]
         to.write(json.dumps([job, arguments]) + "\n")
         to.flush()
@@ -81,7 +84,7 @@ class Timer:
 
 @contextlib.contextmanager
 def other_tree(commit: str) -> Iterator[Path]:
-    """Make a worktree of a commit for the time of the context."""
+    """Make a git worktree of a commit, yield its path, and remove it at the end."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
         git = ["git", "-C", str(ROOT), "worktree"]
@@ -98,7 +101,7 @@ def other_tree(commit: str) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def timer(tree: Path, threads: int) -> Iterator[Timer]:
-    """Start a process that times a tree with the present environment."""
+    """Start a process that times the library of a source tree, with the packages of this Python."""
     surroundings = os.environ | {
         "PYTHONPATH": str(tree),
         "OMP_NUM_THREADS": str(threads),
@@ -116,7 +119,7 @@ def timer(tree: Path, threads: int) -> Iterator[Timer]:
 
 
 def compare_with_commit(o: Options, commit: str) -> list[Row]:
-    """Time the present code and a commit by turns, and return the ratios."""
+    """Time the present code and that of a commit by turns; return a row for each number's ratio."""
     rows = list[Row]()
     with (
         other_tree(commit) as tree,
@@ -135,7 +138,10 @@ def compare_with_commit(o: Options, commit: str) -> list[Row]:
 
 
 def list_jobs(views: list[str], hand: str, o: Options) -> list[tuple[str, dict[str, Any]]]:
-    """Return the jobs of timed.py for a hand; a small plan comes first, which is not counted."""
+    """Return the jobs of timed.py for a hand: pairs of name and arguments.
+
+    `views` are the paths of clouds. The first job is a small plan, which is not counted.
+    """
     work = {"hand": hand, "starts": o.starts, "seed": o.seed}
     jobs: list[tuple[str, dict[str, Any]]] = [("shape", {"view": x, "seed": o.seed}) for x in views]
     jobs += [("plan", {"view": x, "friction": f, **work}) for x in views for f in FRICTIONS]
@@ -146,7 +152,11 @@ def list_jobs(views: list[str], hand: str, o: Options) -> list[tuple[str, dict[s
 def take_turns(
     timers: tuple[Timer, Timer], jobs: list[tuple[str, dict[str, Any]]]
 ) -> tuple[list[Numbers], list[Numbers]]:
-    """Return the numbers of all jobs but the first, here and there; who begins alternates."""
+    """Run each job in both processes, and return the numbers of all jobs but the first, of each
+    process.
+
+    The process that begins alternates from job to job.
+    """
     found: tuple[list[Numbers], list[Numbers]] = ([], [])
     for k, (job, arguments) in enumerate(tqdm(jobs, disable=None, leave=False)):
         for side in (0, 1) if k % 2 else (1, 0):
@@ -155,7 +165,7 @@ def take_turns(
 
 
 def write_view(path: Path, cloud: PointCloud) -> Path:
-    """Write the fields of a cloud for `timed.read_view`."""
+    """Write the fields of a cloud to an .npz file for `timed.read_view`; return the file's path."""
     names = ("points", "normals", "viewpoint", "frustum")
     fields = {name: getattr(cloud, name) for name in names}
     np.savez(path, **{name: x.numpy() for name, x in fields.items() if x is not None})
@@ -163,7 +173,10 @@ def write_view(path: Path, cloud: PointCloud) -> Path:
 
 
 def ratio_rows(what: str, here: list[Numbers], there: list[Numbers], commit: str) -> list[Row]:
-    """Return a row for each measure: its values here and there, and their ratio."""
+    """Return a row for each of `MEASURES`: its values here and at another commit, and their ratio.
+
+    `here` and `there` hold the numbers of all jobs, and `what` is the beginning of each row.
+    """
     rows = list[Row]()
     for name, text, statistic, unit, bar in MEASURES:
         values = [summarise(numbers, name, statistic) for numbers in (here, there)]
@@ -187,7 +200,11 @@ def ratio_rows(what: str, here: list[Numbers], there: list[Numbers], commit: str
 
 
 def summarise(found: list[Numbers], name: str, statistic: str) -> float:
-    """Return a statistic of a number over the jobs that give it; a rate is one over `all`."""
+    """Return a statistic of the number `name` over the jobs that have it; NaN if none has.
+
+    `statistic` is "median", "worst decile" (the 90 % quantile), "sum" or "rate". A rate is the sum
+    over the seconds of all plans.
+    """
     values = np.array([numbers[name] for numbers in found if name in numbers])
     values = values[~np.isnan(values)]
     if not len(values):

@@ -18,8 +18,10 @@ to grasps, and the least executable grasps for each CPU second.
 
 @bench("plan/pace", objects=True)
 def keep_pace(o: Options) -> list[Row]:
-    """Plan on one view of each object at each friction, and time the batches; the first plan is not
-    counted. With `beside`, all is done at another commit, too.
+    """Plan on one view of each object at each friction; time the first grasp, fifty and all.
+
+    A plan before is not counted. If the options name a commit `beside`, all is timed at this
+    commit, too, and the rows are ratios.
     """
     if o.beside is not None:
         return compare_with_commit(o, o.beside)
@@ -39,7 +41,10 @@ def keep_pace(o: Options) -> list[Row]:
 
 
 def rows_of(hand: str, objects: int, found: list[Numbers]) -> list[Row]:
-    """Return a row for each time and one for the rate; targets are those of the Allegro hand."""
+    """Return a row for each time and one for the rate of grasps, over all plans of a hand.
+
+    `found` holds the numbers of each plan. Only the Allegro hand has targets.
+    """
     what = f"{hand}, {objects} objects, friction {' and '.join(map(str, FRICTIONS))}"
     rows = list[Row]()
     for (name, text, statistic, unit, _), bar in zip(MEASURES, BARS, strict=False):

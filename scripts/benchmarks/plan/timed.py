@@ -38,7 +38,7 @@ POINTS = 10_000
 
 
 class Calls(TorchDispatchMode):
-    """Counts the operations of torch inside the context."""
+    """A context that counts the operations of torch inside it, in `count`."""
 
     count = 0
 
@@ -50,12 +50,12 @@ class Calls(TorchDispatchMode):
 
 @cache
 def read_hand(name: str) -> Hand:
-    """Return a hand, loaded once."""
+    """Return the shipped hand `name`; it is loaded once in this process."""
     return load_hand(name)
 
 
 def read_view(view: str) -> PointCloud:
-    """Return the cloud of a file of `write_view`; "jug" is the shipped one."""
+    """Return the cloud [m] of a file of `write_view`; "jug" means the view of the shipped jug."""
     if view == "jug":
         return load_object("jug").view
     with np.load(view) as fields:
@@ -65,8 +65,10 @@ def read_view(view: str) -> PointCloud:
 def time_stream(
     cloud: PointCloud, hand: Hand, friction: float, starts: int, seed: int
 ) -> dict[str, float]:
-    """Return CPU seconds from a cloud to the first grasp, to fifty and to all, and the number of
-    grasps. The seconds are NaN if there are none.
+    """Plan grasps on a cloud one batch after another, and return the times and the count by name.
+
+    "first", "fifty" and "all" are CPU seconds from the cloud to the first grasp, to fifty and to
+    the end. The first two are NaN if there are too few grasps. "grasps" is their number.
     """
     spec = ContactSpec(friction=friction, table=0.0)
     found = {"first": math.nan, "fifty": math.nan}
@@ -83,12 +85,16 @@ def time_stream(
 
 
 def plan(view: str, hand: str, friction: float, starts: int, seed: int) -> dict[str, float]:
-    """Return the same for a view and a hand by their names."""
+    """Return the numbers of `time_stream` for the file of a view and the name of a hand."""
     return time_stream(read_view(view), read_hand(hand), friction, starts, seed)
 
 
 def shape(view: str, seed: int) -> dict[str, float]:
-    """Return the CPU seconds of a shape, of its first predictions, its surface and its field."""
+    """Return the CPU seconds of steps with a view's shape, by name.
+
+    The steps are its fit, predictions of points with and without all covariances, its surface, and
+    its distance field.
+    """
     cloud = read_view(view)
     times = dict[str, float]()
 
@@ -115,7 +121,7 @@ def shape(view: str, seed: int) -> dict[str, float]:
 
 
 def calls(hand: str, starts: int, seed: int) -> dict[str, float]:
-    """Return the number of operations of torch in a plan on the shipped jug."""
+    """Return the number of operations of torch in a plan on the shipped jug, as "calls"."""
     cloud = read_view("jug")
     spec = ContactSpec(friction=0.8, table=0.0)
     with Calls() as counted:
@@ -124,8 +130,10 @@ def calls(hand: str, starts: int, seed: int) -> dict[str, float]:
 
 
 def cold(hand: str, starts: int, seed: int) -> dict[str, float]:
-    """Return the CPU seconds of a new process that imports the library. Return also those of one
-    that plans on the shipped jug without a report.
+    """Return the CPU seconds of two new processes.
+
+    "import" is of one that imports the library. "command" is of one that plans on the shipped jug
+    without a report.
     """
     with tempfile.TemporaryDirectory() as out:
         words = ["grasp", "jug", "--hand", hand, "--no-report", "--out", out]
@@ -148,7 +156,7 @@ JOBS = {"plan": plan, "shape": shape, "calls": calls, "cold": cold}
 
 
 def answer(line: str) -> str:
-    """Return the numbers of a job as a line."""
+    """Run the job of a line of input, the JSON of [name, arguments]; return its numbers as JSON."""
     name, arguments = json.loads(line)
     return json.dumps(JOBS[name](**arguments))
 

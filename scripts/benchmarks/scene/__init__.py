@@ -1,1 +1,1 @@
-"""Scenes of things on a table, beside their bars."""
+"""Benches of scenes of things on a table, seen in depth images, each with a target."""

@@ -19,12 +19,13 @@ from torchgrasp.geometry.plane import Plane
 
 @dataclasses.dataclass(frozen=True)
 class Understood:
-    """What `Scene.from_depth` understood of a room.
+    """What `Scene.from_depth` found in the depth image of a room, beside what is true.
 
-    `degrees` and `mm` are the errors of the table; infinite where no table is found. `offered`
-    tells whether one of the supports is right. `lone` has the fate of each lone thing: "one",
-    "split", "joined" or "missed". `extra` has the furniture's name and the number of pixels of each
-    other object of more than 100 pixels.
+    `degrees` and `mm` are the errors of the table's normal and height; infinite where no table is
+    found. `offered` tells whether one of the supports is right. `lone` says what became of each
+    thing that stands alone, by its label: "one", "split", "joined" or "missed". `extra` has (name
+    of furniture, pixels) of each object that is furniture, if it has more than 100 pixels.
+    `seconds` is CPU time.
     """
 
     degrees: float
@@ -41,7 +42,9 @@ class Understood:
 
 
 def understand(room: Room) -> Understood:
-    """Return what is understood of a room in the camera's frame, without a hint."""
+    """Read a room's depth image without its camera pose or table; return the result beside the
+    truth.
+    """
     began = time.process_time()
     try:
         scene = Scene.from_depth(room.depth, room.intrinsics)
@@ -69,8 +72,10 @@ def understand(room: Room) -> Understood:
 def plane_error(
     plane: Plane, normal: Tensor, at: Tensor, height: float = 0.0
 ) -> tuple[float, float]:
-    """Return the angle [deg] of a plane to the true normal (3,). Return also the error [mm] of the
-    `height` [m] of a point (3,) above it.
+    """Return the errors (degrees, mm) of a plane.
+
+    The first is its angle [deg] to the true `normal` (3,). The second is the error [mm] of a height
+    above it: that of the point `at` (3,) [m], which is truly `height` [m].
     """
     cosine = float(plane.normal.double() @ normal.double())
     found = float(plane.height(at.double()))
@@ -90,8 +95,9 @@ def _fate(labels: Int[Tensor, "h w"], true: Tensor) -> str:
 
 @bench("scene/rooms")
 def look_around(o: Options) -> list[Row]:
-    """Measure what is understood of rooms with edges, floors, walls, bins, shelves and boards, by
-    four cameras.
+    """Measure which tables and things are found in rendered rooms, by models of four cameras.
+
+    Rooms have edges, floors, walls, bins, shelves and tilted boards.
     """
     scenes = range(o.seed, o.seed + o.times(len(KINDS) * 8))
     seen = [

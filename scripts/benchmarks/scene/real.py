@@ -46,8 +46,8 @@ KEPT = 0.95
 
 @bench("scene/real", objects=True)
 def real(o: Options) -> list[Row]:
-    """Return, over the frames of a folder, how many supports are right, the objects found, and the
-    masks kept.
+    """Return rows over the real frames of a folder: how many supports are right, how many objects
+    are found, and how much of given masks is kept.
     """
     folder = o.objects[0]
     if not (folder / "frames.json").exists():
@@ -95,12 +95,15 @@ def real(o: Options) -> list[Row]:
 
 
 def read(folder: Path, name: str, kind: str) -> np.ndarray:
-    """Return an image of a frame."""
+    """Return the image of a frame, (h, w): of kind "depth" [mm] or "label"."""
     return np.asarray(Image.open(folder / f"{name}_{kind}.png"))
 
 
 def is_right(name: str, error: tuple[float, float]) -> bool:
-    """Tell whether a support of a frame is the true one, by its angle [deg] and its error [mm]."""
+    """Tell whether a support's `error`, its angle [deg] and height [mm], is within the bounds.
+
+    Frames whose `name` begins with that of homes have wider bounds.
+    """
     degrees, mm = (HOME_DEGREES, HOME_MM) if name.startswith(HOME) else (DEGREES, MM)
     return error[0] < degrees and error[1] < mm
 
@@ -108,8 +111,10 @@ def is_right(name: str, error: tuple[float, float]) -> bool:
 def support_errors(
     supports: Sequence[Plane], frame: dict[str, Any], normal: Sequence[float] = ()
 ) -> list[tuple[float, float]]:
-    """Return the angle [deg] of each support to the `normal`, by default that of the frame. Return
-    also the error [mm] of the camera's height above it.
+    """Return the errors (degrees, mm) of each support in the camera's frame.
+
+    The first is its angle [deg] to the true `normal`; empty means that of the frame. The second is
+    the error [mm] of the camera's height above it.
     """
     true = torch.tensor(normal or frame["table_normal"], dtype=torch.float64)
     camera = torch.zeros(3, dtype=torch.float64)
@@ -117,10 +122,10 @@ def support_errors(
 
 
 def judge_variant(folder: Path, name: str, frame: dict[str, Any], seed: list[int]) -> str:
-    """Return what becomes of the support in a random variant of a frame.
+    """Return what becomes of the true support in a random variant of a frame, as a word.
 
-    It is "right", or "offered" behind another one. Else it is "vertical" if the first one is, or
-    "wrong", or "refused".
+    "right": it is found first. "offered": it is found behind another one. "refused": no support is
+    found. "vertical" and "wrong": it is not found, and the first support is vertical or not.
     """
     depth, intrinsics, normal = vary(folder, name, frame, np.random.default_rng(seed))
     try:
@@ -137,9 +142,11 @@ def judge_variant(folder: Path, name: str, frame: dict[str, Any], seed: list[int
 def vary(
     folder: Path, name: str, frame: dict[str, Any], draw: np.random.Generator
 ) -> tuple[np.ndarray, list[float], list[float]]:
-    """Return a frame's depth image, turned about the camera's axis, cut, perhaps mirrored and with
-    noise. Return also its intrinsics, with the size of the image, and the true normal in its
-    camera's frame.
+    """Return a random variant of a frame: (depth image [mm], intrinsics, true normal).
+
+    The image is turned about the camera's axis, cut, perhaps mirrored, and has noise. The
+    intrinsics are fx, fy, cx, cy, width and height [pixels]. The table's normal is in the camera's
+    frame of the variant.
     """
     depth = read(folder, name, "depth")
     fx, fy, cx, cy = frame["intrinsics"]
@@ -167,8 +174,10 @@ def vary(
 
 
 def kept_shares(folder: Path, name: str, frame: dict[str, Any]) -> list[float]:
-    """Return the intersection over union of each true label and of the pixels that a scene keeps of
-    the label.
+    """Give a scene the true labels of a frame, and return how much of each label it keeps.
+
+    It is the intersection over union of the label and of the pixels that the scene keeps. Without
+    an image of labels the list is empty.
     """
     if not (folder / f"{name}_label.png").exists():
         return []

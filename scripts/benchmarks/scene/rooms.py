@@ -27,9 +27,11 @@ CLEARANCE = 3
 
 @dataclasses.dataclass(frozen=True)
 class Room:
-    """One depth image [m] of a room, and what is true about it.
+    """One depth image [m] of a room, and what is true about it, in a world with z up.
 
-    The world's z points up. Label 0 is furniture or nothing, label k is the thing `names[k - 1]`.
+    In `labels`, 0 is furniture or nothing, and k is the thing `names[k - 1]`. In `furniture`, 0 is
+    a thing or nothing, and k is the part `parts[k - 1]` of the furniture. `table` is the support's
+    plane and `meshes` [m] are the things, both in the world's frame.
     """
 
     kind: str
@@ -50,8 +52,10 @@ class Room:
         return self.table.moved(torch.linalg.inv(self.camera_pose))
 
     def lone(self, least: int = 400) -> tuple[int, ...]:
-        """Return the labels of things that stand alone in the picture, whole and with enough
-        measured pixels.
+        """Return the labels of things that stand alone in the picture.
+
+        Such a thing does not reach the picture's rim, and has no other thing beside it. It has at
+        least `least` measured pixels.
         """
         from scipy.ndimage import binary_dilation
 
@@ -113,10 +117,11 @@ def rooms(seed: int, kind: str | None = None, sensor: SensorName | None = None) 
 
 
 class Furniture(NamedTuple):
-    """Named parts, the radius [m] of the circle that things stand in, and the limits of the view.
-    The limits are azimuths, elevations [deg] and distances [m].
+    """The furniture of a room: its named parts, with the support's top in the plane z = 0.
 
-    `tilt` turns the support about the origin, as a rotation vector.
+    `radius` [m] is that of the circle about the origin in which things stand. `view` has the limits
+    of the camera's azimuth [deg], elevation [deg] and distance [m]. `tilt` turns the support about
+    the origin; it is a rotation vector [rad].
     """
 
     parts: list[tuple[str, trimesh.Trimesh]]

@@ -16,7 +16,7 @@ from torchgrasp.geometry.frames import rigid, rotation_from_vector
 def scatter(
     meshes: Sequence[trimesh.Trimesh], generator: torch.Generator, radius: float, gap: float
 ) -> Float[Tensor, "n 4 4"]:
-    """Return random poses of meshes that stand upright on the table z = 0.
+    """Return random poses (n, 4, 4) [m] of n meshes that stand upright on the table z = 0.
 
     The footprints, convex hulls seen from above, lie within `radius` [m] of the origin and at least
     `gap` [m] apart. Meshes that do not fit raise `BadArgument`.
@@ -55,7 +55,10 @@ def _random_pose(height: float, generator: torch.Generator, radius: float) -> Fl
 
 
 def footprint(mesh: trimesh.Trimesh) -> Float[Tensor, "n 2"]:
-    """Return the corners of the convex hull of a mesh, seen from above, in order."""
+    """Return the corners (n, 2) [m] of the convex hull of a mesh seen from above.
+
+    They run counter-clockwise.
+    """
     from scipy.spatial import ConvexHull
 
     flat = np.array(mesh.vertices, dtype=np.float64)[:, :2]
@@ -63,8 +66,10 @@ def footprint(mesh: trimesh.Trimesh) -> Float[Tensor, "n 2"]:
 
 
 def separation(a: Float[Tensor, "n 2"], b: Float[Tensor, "m 2"]) -> float:
-    """Return a lower bound of the distance of two convex polygons: the widest strip along an edge
-    between them.
+    """Return a lower bound of the distance [m] of two convex polygons; negative if they overlap.
+
+    The corners of both run counter-clockwise. The bound is the width of the widest strip between
+    them that runs along an edge of one of them.
     """
     return max(_widest_strip(a, b), _widest_strip(b, a))
 

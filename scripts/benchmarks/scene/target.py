@@ -70,9 +70,10 @@ LIMIT = 1800.0
 
 @dataclasses.dataclass(frozen=True)
 class Clutter:
-    """Bodies on the table z = 0, of which the first is the target, and one image of them.
+    """Bodies on the table z = 0, the first of which is the target, and one depth image [m].
 
-    `hidden` is the share of the target's pixels that neighbours cover.
+    `family` is the target's. `meshes` and their convex `parts` [m] are in the world's frame. In
+    `labels`, 1 is the target. `hidden` is the share of the target's pixels that neighbours cover.
     """
 
     names: tuple[str, ...]
@@ -87,7 +88,7 @@ class Clutter:
 
 @dataclasses.dataclass(frozen=True)
 class TargetTry:
-    """What became of one target that was given in one way.
+    """What became of one target that was given in one way, "mask" or "click".
 
     `purity` is the share of the pixels taken for the target that are its own. `share` is the share
     of its own measured pixels that are taken. Without a grasp, `said` is the reason, and `clear`
@@ -144,7 +145,10 @@ def target(o: Options) -> list[Row]:
 
 
 def try_scene(o: Options, k: int, hand: str) -> list[dict[str, Any]]:
-    """Return the fields of the tries of one scene; kept ones are read."""
+    """Try the target of scene k in each way (`WAYS`), and return the fields of each `TargetTry`.
+
+    A result that an earlier call wrote to a file is read.
+    """
     path = o.out / "target" / f"{hand}_{o.starts}_{o.simulator}_{k:03d}.json"
 
     def try_ways() -> list[dict[str, Any]]:
@@ -155,15 +159,16 @@ def try_scene(o: Options, k: int, hand: str) -> list[dict[str, Any]]:
 
 
 def read_try(outcome: dict[str, Any]) -> TargetTry:
-    """Return a try from a file, in which a success that is unknown is null."""
+    """Return a `TargetTry` from its fields in a JSON file, in which an unknown success is null."""
     if outcome["predicted"] is None:
         outcome = outcome | {"predicted": math.nan}
     return TargetTry(**outcome)
 
 
 def make_clutter(draw: np.random.Generator, k: int) -> Clutter:
-    """Return the k-th scene: bodies pushed together around the target, before a camera that sees
-    it.
+    """Return the k-th scene: random bodies pushed together around the target, and a camera's image.
+
+    The camera sees enough of the target. In scenes of odd k, neighbours hide some of it.
     """
     while True:
         bodies = [draw_body(draw, k)]
@@ -188,7 +193,10 @@ def make_clutter(draw: np.random.Generator, k: int) -> Clutter:
 
 
 def draw_body(draw: np.random.Generator, k: int | None = None) -> HouseholdBody:
-    """Return a random body of the families left out; with `k`, of the k-th family of them."""
+    """Return a random household body of the families that fitted no tree of the success model.
+
+    With a number `k` it is of the k-th of these families, counted in a cycle.
+    """
     among = sorted(CALIBRATING)
     family = among[k % len(among)] if k is not None else among[draw.integers(len(among))]
     place = list(FAMILIES).index(family)
@@ -203,8 +211,10 @@ def draw_body(draw: np.random.Generator, k: int | None = None) -> HouseholdBody:
 def push_together(
     meshes: Sequence[trimesh.Trimesh], draw: np.random.Generator
 ) -> list[Float[Tensor, "4 4"]]:
-    """Return upright poses, the first mesh above the origin. Each other one is moved towards it
-    from outside until its gap is reached.
+    """Return poses (4, 4) [m] of upright meshes that stand close together, the first at the origin.
+
+    Each other one is moved towards the origin from outside, until a gap to one of those before is
+    reached. The gap is random, and sometimes that of a touch.
     """
     placed = list[Float[Tensor, "k 2"]]()
     poses = list[Float[Tensor, "4 4"]]()
@@ -228,12 +238,15 @@ def push_together(
 
 
 def moved(mesh: trimesh.Trimesh, pose: Float[Tensor, "4 4"]) -> trimesh.Trimesh:
-    """Return a mesh at another pose."""
+    """Return a copy of a mesh [m], moved by the rigid transform `pose` (4, 4)."""
     return mesh.copy().apply_transform(pose.numpy())
 
 
 def try_target(clutter: Clutter, k: int, way: str, hand: str, o: Options) -> TargetTry:
-    """Plan for the target of a scene, and lift it with its best grasp."""
+    """Find the target of scene k in its image, plan for it, and lift it by the best grasp.
+
+    `way` says how the target is given: "mask" or "click".
+    """
     trial = PROTOCOLS["table-lift"].with_trial(simulator=o.simulator).trial
     told = TargetTry(k, clutter.family, len(clutter.names) - 1, clutter.hidden, way)
     own = clutter.labels == 1
@@ -262,7 +275,7 @@ def try_target(clutter: Clutter, k: int, way: str, hand: str, o: Options) -> Tar
 
 
 def middle_of(mask: Tensor) -> tuple[int, int]:
-    """Return the pixel (u, v) that is farthest from the rim of a mask."""
+    """Return the pixel (column, row) of a mask that is farthest from the mask's rim."""
     away = np.asarray(distance_transform_edt(mask.numpy()))
     row, column = np.unravel_index(int(away.argmax()), mask.shape)
     return int(column), int(row)
@@ -271,7 +284,10 @@ def middle_of(mask: Tensor) -> tuple[int, int]:
 def lift_target(
     clutter: Clutter, plan: ScenePlan, told: TargetTry, hand: str, trial: TrialSpec, seed: int
 ) -> TargetTry:
-    """Return the try with the lift of the plan's best grasp."""
+    """Lift the target by the best grasp of a plan; return the try `told` with the outcome added.
+
+    Without a grasp, the reasons and the number of neighbours to take away are added.
+    """
     best = plan.best
     if best is None or best.grasps is None:
         reasons = "; ".join(dict.fromkeys(x.reason for x in plan.things if x.reason))
@@ -292,7 +308,10 @@ def lift_target(
 
 
 def largest_motion(meshes: Iterable[trimesh.Trimesh], motion: Float[Tensor, "n 4 4"]) -> float:
-    """Return the largest motion [m] of the middle of a mesh."""
+    """Return the largest distance [m] by which a mesh's middle moves under rigid motions (n, 4, 4).
+
+    There is one motion for each mesh.
+    """
     middle = torch.stack([torch.from_numpy(mesh.bounds.mean(0)) for mesh in meshes])
     motion = motion.double()
     after = (motion[:, :3, :3] @ middle[..., None])[..., 0] + motion[:, :3, 3]
@@ -346,7 +365,7 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
 
 
 def describe_group(tries: Sequence[TargetTry]) -> str:
-    """Return counts of a group of tries."""
+    """Return as text how many tries of a group held or had no grasp, and their mean prediction."""
     planned = [x for x in tries if x.status != "NO_GRASP"]
     if not tries:
         return "none"
