@@ -78,7 +78,8 @@ class Advice(Value):
 def judge_view(
     cloud: PointCloud, clean: PointCloud, up: Vector, table: Plane | None, stands: bool = True
 ) -> list[Advice]:
-    """Return advice on a cloud's camera, vertical, table and pixels, and on other bodies in it.
+    """Return advice on a view's camera, upward direction, table and flying pixels, and on other
+    bodies in the cloud.
 
     Advice with `refused` True comes first. `clean` is the cloud without outliers, with outward
     normals and perhaps an estimated viewpoint. `up` is the unit vector that points up. A `table` of
@@ -119,7 +120,7 @@ def judge_view(
 
 
 def check_camera(clean: PointCloud) -> None:
-    """Raise `BadArgument` if the given camera of a view cannot have seen the view's points.
+    """Raise `BadArgument` if a camera at a cloud's `viewpoint` cannot have seen the cloud's points.
 
     It cannot if over 15 % of the points would be edge-on (`UNSEEN.edge_on`). It cannot either if
     over 20 % would lie behind others (`UNSEEN.behind`). `clean` is a cloud without outliers, with

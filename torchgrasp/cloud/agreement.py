@@ -105,8 +105,8 @@ def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -
     At most 20 % of the points (`AGREEMENT.share`) may be off it. A point is off if its distance
     exceeds 10 mm (`AGREEMENT.slack`) plus twice the camera's noise (`noise_of`). The mesh [m] is in
     the frame of the cloud. Errors call it by `name`. A `CloudWarning` is given if the median
-    distance exceeds 0.5 mm (`AGREEMENT.beside`) plus noise and pose error. Then the mesh may be
-    that of a similar object.
+    distance exceeds 0.5 mm (`AGREEMENT.beside`), the noise and the cloud's `pose_error` together.
+    Then the mesh may be that of a similar object.
     """
     noise = noise_of(cloud)
     slack = AGREEMENT.slack + 2 * noise
@@ -159,17 +159,19 @@ def check_seen(grasps: Grasps, cloud: PointCloud, name: str) -> None:
 
 
 def check_where(name: str, distance: Callable[[Points], Tensor], cloud: PointCloud) -> None:
-    """Raise `BadArgument` for a region to keep to that lies off a cloud and the space hidden behind
-    it.
+    """Raise `BadArgument` if the region in which contacts must lie is far from a cloud, and from
+    the space behind it.
 
-    Contacts must lie in a region with the `name` "keep", and outside a region with another name. A
-    region is off if it is more than 30 mm (`AGREEMENT.unseen`) from cloud and hidden space. For a
-    cloud without a camera the bound grows by half the cloud's length, in place of the hidden space.
+    The space behind it is what the cloud's points hide from their camera.
+
+    Contacts must lie in a region with the `name` "keep", and outside a region with another name.
+    Far is more than 30 mm (`AGREEMENT.unseen`) from both. For a cloud without a camera the bound
+    grows by half the cloud's length, in place of the hidden space.
 
     The region is given by the function `distance`. It returns the signed distances [m] of points
     [m] from the region, in the frame of the cloud. Errors call the argument `name`.
 
-    A region of another name that is off raises the warning `NoEffect` instead. So does a region
+    A region of another name that is far off raises the warning `NoEffect` instead. So does a region
     "keep" that holds the whole cloud and the space behind it.
     """
     rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
@@ -255,8 +257,10 @@ def check_stand(mesh: "trimesh.Trimesh", table: Plane, name: str = "mesh") -> No
 
 
 def noise_of(cloud: PointCloud) -> float:
-    """Return the depth noise [m] that is assumed for a cloud's camera, as the median over the
-    points.
+    """Return the assumed standard deviation [m] of the depth noise of a cloud's camera.
+
+    It is the median over the points. The assumed noise grows with the squared distance from the camera. An unknown camera counts as
+    0.7 m away.
     """
     eye = None if cloud.viewpoint is None else cloud.viewpoint.double().cpu().reshape(-1, 3).mean(0)
     return float(assume_noise(cloud.points.double().cpu(), eye).median())

@@ -37,11 +37,11 @@ class RenderNumbers:
     """Parameters of the rendering of a mesh and a table by a virtual camera."""
 
     nearest: float = 1e-3
-    """Least distance [m] of all of a mesh from the camera at which the mesh has a box in the image.
+    """Depth [m] of a mesh's nearest vertex, above which rays are cast only in the mesh's bounding
+    box in the image. For a nearer mesh they are cast through all pixels.
     """
     margin: float = 1e-2
-    """Width [focal lengths] of the margin about the box of a mesh in the image, against rounding.
-    """
+    """Width [focal lengths] of a margin around this bounding box, against rounding."""
     table: float = 0.6
     """Radius [m] of the table."""
 

@@ -30,8 +30,8 @@ class CloudNumbers:
     sample: int = 20_000
     """Number of points, about, that are first searched for enough distinct ones."""
     coincident: float = 1e-9
-    """Greatest distance of coincident points, over the cloud's extent: above rounding, below any
-    sensor's resolution.
+    """Greatest distance of coincident points, as a share of the cloud's extent: above rounding,
+    below any sensor's resolution.
     """
     line: float = 1e-6
     """Ratio of the second principal spread of the points to the first, below which they are on a
@@ -46,11 +46,15 @@ class CloudNumbers:
     digit: float = 0.01
     """Step [m] of coordinates that were rounded to two decimals."""
     equal: float = 1e-6
-    """Greatest error of a coordinate that is rounded to such a step, over the step."""
+    """Greatest error of a coordinate that is rounded to such a step, as a share of the step."""
     coarse: float = 0.002
-    """Least step [m] of coordinates for a warning: its rounding is as large as a camera's noise."""
+    """Least step [m] of coordinates for a warning: its rounding errors are as large as a camera's
+    noise.
+    """
     farthest: float = 50.0
-    """Greatest distance [m] of a camera; depth images measure no farther, and one in cm is."""
+    """Greatest distance [m] of a camera from the points. Depth images measure no farther; a camera
+    that is farther off is perhaps given in cm.
+    """
 
 
 CLOUD = CloudNumbers()
@@ -82,9 +86,11 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
     """Return a cloud without duplicate points, which would count as independent measurements.
 
-    Of coincident points the first is kept. Raises `TooFewPoints` for fewer than 4 distinct points,
-    and `SuspiciousScale` for an extent outside [5 mm, 2 m]. Other faults raise `BadArgument`
-    (`check_cloud`).
+    Of coincident points the first is kept, with its normal and camera.
+
+    Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
+    outside [5 mm, 2 m]. Raises `BadArgument` for points on one line, a normal of length zero, or a
+    camera over 50 m away.
     """
     points = _check(cloud)
     rows = _distinct_rows(points)
@@ -104,9 +110,9 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
         voxel: side [m] of the voxels, 0.00001 to 1. Their grid starts at the cloud's least x, y and
             z.
 
-    Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
-    outside [5 mm, 2 m]. Other faults raise `BadArgument` (`check_cloud`). Raises `TooFewPoints` if
-    fewer than 4 voxels hold points.
+    Raises `TooFewPoints` for fewer than 4 distinct points, or if fewer than 4 voxels hold points.
+    Raises `SuspiciousScale` for an extent outside [5 mm, 2 m]. Raises `BadArgument` for points on
+    one line, a normal of length zero, or a camera over 50 m away.
 
     >>> len(voxel_downsample(PointCloud(0.1 * torch.rand(5000, 3)), 0.05)) <= 27
     True
@@ -132,7 +138,8 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
     more than 2.5 times (`NEAR.outlier`) the median of all points.
 
     Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
-    outside [5 mm, 2 m]. Other faults raise `BadArgument` (`check_cloud`).
+    outside [5 mm, 2 m]. Raises `BadArgument` for points on one line, a normal of length zero, or a
+    camera over 50 m away.
 
     >>> points = torch.cat([0.1 * torch.rand(500, 3), torch.ones(1, 3)])
     >>> bool(remove_outliers(PointCloud(points)).points.max() < 0.2)
@@ -203,7 +210,10 @@ def coordinate_step(points: Points) -> float:
 
 
 def describe_step(step: float) -> str:
-    """Return words that say to which step [m] the coordinates of a cloud are rounded."""
+    """Return a text on the `step` [m] to which a cloud's coordinates are rounded, for messages.
+
+    It is, for example, "coordinates in steps of 10 mm, of few digits or far from the origin".
+    """
     return f"coordinates in steps of {1e3 * step:.2g} mm, of few digits or far from the origin"
 
 
@@ -249,9 +259,10 @@ def _distinct_rows(points: Points) -> Int[Tensor, "m"]:
 
 
 def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:
-    """Return the index of the first point of each group 0, 1, ...
+    """Return the index of the first point of each group; entry i of the result is for group i.
 
-    `group` holds the group's number of each of n points; no group is empty.
+    `group` (n,) holds the number of each point's group, 0, 1, ...; no group is empty. The index is
+    one of the n points.
     """
     order = torch.arange(len(group), device=group.device)
     first = torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")

@@ -59,7 +59,7 @@ class DepthNumbers:
     levels: int = 10
     """Least number of different depths that show their step: an image of few faces has fewer."""
     even: float = 1e-3
-    """Greatest error of a depth that is a whole number of steps, over the step."""
+    """Greatest error of a depth that is a whole number of steps, as a share of the step."""
     coarse: float = 0.005
     """Least step [m] of the depths for a warning: it is larger than edges of things and noise."""
     several: float = 0.05

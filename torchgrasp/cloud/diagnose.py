@@ -137,8 +137,8 @@ def diagnose_cloud(
             may be below it.
 
     Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
-    outside [5 mm, 2 m]. Other faults raise `BadArgument` (`check_cloud`). Raises `BadArgument` for
-    a vector `up` of length zero.
+    outside [5 mm, 2 m]. Raises `BadArgument` for points on one line, a vector of length zero, or a
+    camera over 50 m away.
 
     >>> cloud = PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> diagnose_cloud(cloud).copies

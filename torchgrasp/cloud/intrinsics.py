@@ -61,18 +61,18 @@ class IntrinsicsNumbers:
     shown_name: int = 20
     """Greatest number of letters of each name in an error."""
     focal: float = 0.15
-    """Least focal length over the side of the image. It is a view of 147 degrees, wider than any.
+    """Least focal length, as a share of the image's side. It means a view of 147 degrees; no camera
+    has a wider one.
     """
     unequal: float = 0.05
-    """Greatest difference of fx and fy, over fy, at which four numbers count as in the right order.
-    """
+    """Greatest difference of fx and fy, as a share of fy, of four numbers in the right order."""
     uneven: float = 0.12
-    """Difference of fx and fy, over fy, from which a warning is given. Pixels of old cameras differ
-    by less, images that were resized to other proportions by more.
+    """Difference of fx and fy, as a share of fy, from which a warning is given. Pixels of old
+    cameras differ by less, images that were resized to other proportions by more.
     """
     beside: float = 0.1
-    """Greatest shift of the principal point from the image's middle, over the side, of numbers in
-    the right order.
+    """Greatest shift of the principal point from the image's middle, for four numbers in the right
+    order. It is a share of the side.
     """
     farthest: float = 8.0
     """Greatest shift of the principal point of a crop from the crop's middle, as a share of the
@@ -88,11 +88,12 @@ class IntrinsicsNumbers:
     """
     cropped: float = 0.03
     """Greatest shift of the principal point from the middle of a camera's image that was perhaps
-    cropped, and least shift from the middle of the crop. It is over half the side.
+    cropped. It is also the least shift from the middle of the crop. Both are shares of half the
+    side.
     """
     centred: float = 0.05
-    """Greatest shift of the principal point from the middle of an image whose size is guessed, over
-    half the side.
+    """Greatest shift of the principal point from the middle of an image whose size is guessed. It
+    is a share of half the side.
     """
     scaled: float = 2.5
     """Ratio of the principal point's coordinates to those of the image's middle, or its inverse.
@@ -100,7 +101,7 @@ class IntrinsicsNumbers:
     point of a crop is nearer.
     """
     off: float = 0.16
-    """Shift of the principal point from the middle, over half the side. Beyond it another
+    """Shift of the principal point from the middle, as a share of half the side. Beyond it another
     resolution is guessed: few cameras have more.
     """
     agree: float = 0.5

@@ -121,7 +121,7 @@ class Lens(NamedTuple):
 
 
 def describe(coefficients: object) -> str:
-    """Return the coefficients of a distortion as short text."""
+    """Return the coefficients of a distortion as text, cut off if it is long."""
     return str(coefficients)[:SHOWN_LETTERS]
 
 
@@ -136,12 +136,13 @@ def numbers_of(value: object) -> list[float]:
 
 
 def read_lens(named: Mapping[str, Any]) -> Lens | None:
-    """Return the distortion among a camera's values, given by name; None if there is hardly any.
+    """Return the distortion of a camera, given the values that a driver states, by name; None if
+    there is hardly any.
 
     Names are in lower case. There is hardly any if no coefficient exceeds 0.001 (`LENS.straight`).
     Raises `BadArgument` for a model that is no rational polynomial, such as a fisheye's. Raises it
-    also for a list of fewer than 4 coefficients, or with one after the eighth. The same is raised
-    for a coefficient that is not below 10,000 (`LENS.most`).
+    also for fewer than 4 coefficients in a list, or one other than 0 after the eighth. The same is
+    raised for a coefficient that is not below 10,000 (`LENS.most`).
     """
     lists = [named[name] for name in LISTS if named.get(name) is not None]
     found = {name: named[name] for name in (*NAMES, *OFF_CENTRE) if named.get(name) is not None}

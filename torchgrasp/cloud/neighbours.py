@@ -20,8 +20,8 @@ class NeighbourNumbers:
     """Numbers of neighbours of a point, itself included, and parameters of the fits to them."""
 
     spacing: int = 9
-    """Number of neighbours by which the spacing is measured: a raster's eight and the point. More
-    than fly off a rim together.
+    """Number of neighbours by which the spacing is measured: a raster's eight and the point. Flying
+    pixels come in smaller groups, so each counts as far from its neighbours.
     """
     outlier: float = 2.5
     """Multiple of the median of the points' mean distances from their neighbours, above which a
@@ -33,7 +33,9 @@ class NeighbourNumbers:
     quadric: int = 30
     """Number of neighbours to which a quadric is fitted: five for each of its six unknowns."""
     width: float = 0.7
-    """Width of the weights of neighbours, over the distance of the farthest."""
+    """Width w of the weights exp(-(d / (w d_k))^2) of neighbours at the distances d. Here d_k is
+    the distance of the farthest neighbour.
+    """
     ridge: float = 1e-3
     """Weight of the squared coefficients of a quadric, other than the constant one, relative to the
     squared errors. It matters only where points are few.
@@ -185,7 +187,8 @@ class Neighbours:
 def fit_local_planes(
     points: Points, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-    """Fit a plane around each of m points; return unit normals of either sign, and rms errors.
+    """Fit a plane to the 25 nearest points (`NEAR.plane`) of each of m points. Return the unit
+    normals (m, 3) of the planes, of either sign, and the rms errors (m,) of the fits.
 
     The m points are those of `points` (n, 3) with the indices `rows`, by default all. The errors
     have the unit of `points`.

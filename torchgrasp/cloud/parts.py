@@ -30,14 +30,17 @@ class PartNumbers:
     near: float = 0.02
     """Distance [m] from the support within which points show its noise."""
     noises: float = 5.0
-    """Half thickness of the support's layer, in median distances of these points from the support.
+    """Half thickness of the support's layer, in multiples of a median distance from the support.
+    It is that of the points within `near`.
     """
     gap: float = 0.04
     """Least distance [m] between two bodies; a bent or hidden surface leaves smaller gaps."""
     spacings: float = 4.0
     """Least distance between two bodies in spacings of the points, for sparse clouds."""
     share: float = 0.1
-    """Least share of the points in a second body; fewer are left over from its cut."""
+    """Least share of the points in a second body. Fewer points are the rest of a body that was cut
+    away.
+    """
     lowest: float = 0.02
     """Share of the points of a body that may be lower than its foot: outliers."""
     foot: float = 0.015
@@ -58,9 +61,10 @@ PARTS = PartNumbers()
 
 
 def label_bodies(points: Points, gap: float = PARTS.gap) -> Int[Tensor, "n"]:
-    """Return the body of each of n points, by number; body 0 has the most points.
+    """Return the number of the body to which each of n points belongs; body 0 has the most points.
 
-    Bodies are more than `gap` [m] apart; the points (n, 3) are in metres.
+    A body is a group of points with steps of at most `gap` [m] from one to the next. The points
+    (n, 3) are in metres.
     """
     device = points.device
     points = points.cpu()
@@ -79,9 +83,10 @@ def label_bodies(points: Points, gap: float = PARTS.gap) -> Int[Tensor, "n"]:
 def find_second_body(points: Points, up: Vector, spacing: float) -> Bool[Tensor, "n"] | None:
     """Return a mask of the points of a second body on the same ground; None if there is none.
 
-    Bodies are more than 40 mm (`PARTS.gap`), and 4 spacings, apart. The second one holds at least
-    10 % of the points (`PARTS.share`). The points (n, 3) are in metres, and `up` is the unit vector
-    that points up. `spacing` [m] is the distance between neighbouring points.
+    Bodies are more than 40 mm (`PARTS.gap`) and more than 4 times the `spacing` [m] of neighbouring
+    points apart. The second one holds at least 10 % of the points (`PARTS.share`). Both bodies
+    stand at most 15 mm (`PARTS.foot`) above the lowest point. The points (n, 3) are in metres, and
+    `up` is the unit vector that points up.
     """
     label = label_bodies(points, max(PARTS.gap, PARTS.spacings * spacing))
     height = points @ up
@@ -160,9 +165,9 @@ def cut_object(
 def cut_exact_table(cloud: PointCloud, up: Vector) -> tuple[PointCloud, Plane | None]:
     """Return a cloud without the points of a table that has no noise, and the plane of the table.
 
-    Such a table is that of a simulated cloud. Its points are cut off in so thin a layer that the
-    object's foot stays. If there is no such table, the cloud itself and None are returned. `up` is
-    the unit vector that points up. Cloud, plane and `up` are in one frame.
+    Such a table is that of a simulated cloud [m]. Points below 0.5 mm (`PARTS.thin`) above it are
+    left out, so the object's foot stays. If there is no such table, the cloud itself and None are
+    returned. `up` is the unit vector that points up. Cloud, plane and `up` are in one frame.
     """
     points = cloud.points.double()
     support = find_ground(points, cloud.viewpoint, up.to(points))
@@ -184,10 +189,10 @@ def find_ground(
     up: Vector,
     level_width: float = SUPPORTS.least_width,
 ) -> SupportPlane | None:
-    """Return the plane on which objects stand; None if there is none.
+    """Return the plane on which objects stand, found among `points`; None if there is none.
 
     A nearly level plane at least `level_width` [m] wide is sought first. If there is none, any
-    plane counts on which the cameras look down. All are in one frame. The points (n, 3) are in
+    plane counts on whose upper side the cameras are. All are in one frame. The points (n, 3) are in
     metres. `eye` holds the camera's position [m], or that of each point; None if it is unknown.
     `up` is the unit vector that points up.
     """

@@ -71,9 +71,9 @@ PIXELS = PixelNumbers()
 
 
 def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None:
-    """Return the camera position [m] from which points (n, 3) [m] form a regular lattice of pixels.
+    """Return the camera position (3,) [m] from which points form a regular lattice of pixels.
 
-    It is None if there is no such position, or for fewer than 100 points (`PIXELS.least`). From the
+    The points (n, 3) [m] and the result are in one frame. It is None if there is no such position, or for fewer than 100 points (`PIXELS.least`). From the
     opposite side, the points form nearly the same lattice. So only cameras on the side of the
     vector `up` are tried. If it is None, the side is the one to which the surface bulges. The
     origin is tried first: there is the camera if the points are in its frame.
@@ -107,12 +107,11 @@ def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None
 def irregularity(
     probes: Float[Tensor, "m 3"], near: Float[Tensor, "m k 3"], eyes: Float[Tensor, "c 3"]
 ) -> Float[Tensor, "c"]:
-    """Return how irregular the pixels are as seen by cameras at each of c positions `eyes` [m] (no
-    unit).
+    """Return how irregularly a cloud's points are spaced as seen from each of c camera positions.
 
-    It is the mean deviation of the angles between neighbouring pixels from their median, over this
-    median. So it is about 0 for a regular lattice. `probes` are m points [m], and `near` the k
-    nearest points of each.
+    It has no unit. It is the mean deviation of the angles between neighbouring points from their median, divided by
+    this median. So it is about 0 for a regular lattice of pixels. `probes` are m points [m], and
+    `near` the k nearest points of each. The positions `eyes` [m] are in the same frame.
     """
     found = list[Tensor]()
     for some in eyes.split(PIXELS.block):

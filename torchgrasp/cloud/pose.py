@@ -268,9 +268,12 @@ def tell_far(pose: Transform) -> tuple[str, ...]:
 
 
 def tell_inverse(pose: Transform) -> tuple[str, ...]:
-    """Return one note if the inverse of a pose is that of an upright camera, else none.
+    """Return one note, a sentence, if the `pose` of a camera was perhaps given as its inverse, else
+    none.
 
-    In the frame of the pose, z is up. Without a table in view, nothing else shows an inverse pose.
+    It was if the camera is rolled by 20 to 70 degrees, but by less than 2 with the inverse. The
+    pose obj_from_camera (4, 4) leads to a frame whose z points up. Without a table in view, nothing
+    else shows an inverse pose.
     """
     roll = math.degrees(math.asin(min(1.0, abs(float(pose[2, 0])))))
     other = math.degrees(math.asin(min(1.0, abs(float(pose[0, 2])))))
@@ -322,11 +325,12 @@ def find_plausible(
 ) -> tuple[SupportPlane, ...]:
     """Return the planes on which objects may stand, the most plausible first.
 
-    `points` (n, 3) [m] and the `table` are in the frame to which the `pose` leads. The table is a
-    plane or a height z [m]. With None, planes are sought in the points. `up` is the direction
-    against gravity in this frame. With None, planes may face any way; but if a plane is level,
-    walls are left out, unless the frame is the camera's. `known_unit` is whether the user gave the
-    unit of the depth. Supports that carry the `target` come first. Raises `BadArgument` for a pose
+    `points` (n, 3) [m] and the `table` are in the frame to which the camera's `pose` (4, 4) [m]
+    leads. The table is a plane or a height z [m]. With None, planes are sought in the points. `up`
+    is the direction (3,) against gravity in this frame. With None, planes may face any way; but if
+    a plane is level, walls are left out, unless the frame is the camera's. `known_unit` is whether
+    the user gave the unit of the depth. `target` holds points of the object to grasp: planes under
+    it come first. Raises `BadArgument` for a pose
     or a unit that the view contradicts, and `NoSupport` if there is no plane.
     """
     eye = pose[:3, 3]
@@ -377,11 +381,12 @@ def _level(
 def check_view(
     points: Points, pose: Transform, up: object, known_unit: bool, target: Target
 ) -> SupportPlane | None:
-    """Return the table in a view, or None if none is found. Raise `BadArgument` if it contradicts
-    the camera's pose or the depth's unit.
+    """Return the table that a view's points show, or None if they show none. Raise `BadArgument` if
+    the table contradicts the camera's pose or the depth's unit.
 
-    `points` (n, 3) [m] are in the frame to which the `pose` leads, and so is the `target`. `up` is
-    the direction against gravity there; None means z. `known_unit` is whether the user gave the
+    `points` (n, 3) [m] are in the frame to which the camera's `pose` (4, 4) [m] leads. `target`
+    holds the points of the object for which the table is sought, in the same frame. `up` is the
+    direction (3,) against gravity there; None means z. `known_unit` is whether the user gave the
     unit of the depth.
     """
     image_up = -pose[:3, 1] if up is None and _is_own(pose) else None
@@ -461,9 +466,9 @@ def _check_normals(supports: tuple[SupportPlane, ...], pose: Transform, up: obje
 def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
     """Return one note, a sentence, if a table is tilted by 5 degrees or more from z, else none.
 
-    The bound is `POSE.told`. z is that of the frame to which `pose` leads, and `plane` is the table
-    in this frame. In the camera's own frame z need not be up. There, a note is returned if the
-    camera hangs upside down or lies on its side.
+    The bound is `POSE.told`. z is that of the frame to which the camera's `pose` (4, 4) leads.
+    `plane` is the table in this frame. With a pose near the identity, z need not be up. There, a
+    note is returned if the camera hangs upside down or lies on its side.
     """
     if _is_own(pose):
         right, down, _ = plane.normal.tolist()

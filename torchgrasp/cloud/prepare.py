@@ -136,7 +136,10 @@ class PreparedCloud(Value):
 
     @property
     def one_sided(self) -> bool:
-        """Whether the cloud shows only what its cameras see: the object has a hidden side."""
+        """Whether the cloud shows only what its cameras see, so that the object has a hidden side.
+
+        It does if the viewpoint is known, and at least 90 % of the normals face it.
+        """
         eye = self.viewpoint
         return eye is not None and share_facing(self.points, self.normals, eye) >= FACING
 
@@ -171,9 +174,9 @@ def prepare_cloud(
     inward.
 
     Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
-    outside [5 mm, 2 m]. Other faults raise `BadArgument` (`check_cloud`). Raises `BadArgument` for
-    more than 16 cameras or normals that point away from the camera. Raises `TooFewPoints` for a
-    view of fewer than 10 points.
+    outside [5 mm, 2 m]. Raises `BadArgument` for points on one line, a normal of length zero, or a
+    camera over 50 m away. It is also raised for more than 16 cameras, or normals that point away
+    from the camera. Raises `TooFewPoints` for a view of fewer than 10 points.
     """
     distinct = remove_duplicates(cloud)
     if neighbours is None or len(distinct) < len(cloud):
@@ -256,7 +259,8 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
     Without both, the viewpoint is estimated, and the result has this viewpoint.
 
     Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
-    outside [5 mm, 2 m]. Other faults raise `BadArgument` (`check_cloud`).
+    outside [5 mm, 2 m]. Raises `BadArgument` for points on one line, a normal of length zero, or a
+    camera over 50 m away.
 
     >>> cloud = PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))
     >>> estimate_normals(cloud).normals.shape
@@ -270,9 +274,12 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 def clean_cloud(cloud: PointCloud) -> PointCloud:
     """Return a cloud without duplicates and outliers, moved onto quadrics around the points.
 
-    Its normals are outward unit normals of the quadrics. Raises `TooFewPoints` for fewer than 4
-    distinct points, and `SuspiciousScale` for an extent outside [5 mm, 2 m]. Other faults raise
-    `BadArgument` (`check_cloud`).
+    A quadric surface is fitted around each point. The normals are the outward unit normals of the
+    quadrics.
+
+    Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
+    outside [5 mm, 2 m]. Raises `BadArgument` for points on one line, a normal of length zero, or a
+    camera over 50 m away.
     """
     cloud = remove_duplicates(cloud)
     return _fit_normals(cloud, Neighbours(cloud.points.double()), clean=True)
@@ -352,8 +359,9 @@ def lie_across(points: Points, normals: Points) -> bool:
 def point_inward(points: Points, normals: Points) -> bool:
     """Return whether normals (n, 3) point to the middle of their `points` (n, 3) [m].
 
-    Then the surface is inside out, or hollow. They do if the sum of (p - c) . n is clearly
-    negative, for points p with the mean c and normals n. By the divergence theorem, outward normals
+    Then the surface is inside out, or hollow. They do if the sum of (p - c) . n, divided by that of
+    |p - c|, is below -0.05 (`NORMALS.inward`). Here p are the points, c is their mean, and n are
+    the normals as unit vectors. By the divergence theorem, outward normals
     of a closed surface give a positive sum. So do those of a view of a surface that bulges.
     """
     away = points - points.mean(0)

@@ -28,8 +28,8 @@ class RayNumbers:
     fits: int = 4
     """Number of fits, each to the points near the plane of the fit before."""
     better: float = 1.3
-    """Least share of points on planes if the depths are distances, over that with the depths as
-    they are.
+    """Least ratio of two shares of points on one plane, at which a note is given. The first share
+    is that with the depths read as distances, the second that with the depths as they are.
     """
 
 
@@ -37,8 +37,8 @@ RAYS = RayNumbers()
 
 
 def tell_rays(depth: Float[Tensor, "h w"], intrinsics: Float[Tensor, "3 3"]) -> tuple[str, ...]:
-    """Return one note, a sentence, if depths [m] are perhaps distances from the camera, or inverse
-    depths; else none.
+    """Return one note, a sentence, if depths (h, w) [m] are perhaps distances along the rays, or
+    inverse depths; else none.
 
     Read as such, they would put over 1.3 times as many points (`RAYS.better`) into one plane. The
     `intrinsics` are in pixels, and depths of 0 are not measured.

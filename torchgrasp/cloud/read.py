@@ -247,8 +247,8 @@ def cloud_from_array(
             unknown.
 
     Raises `TooFewPoints` for fewer than 4 distinct points, and `SuspiciousScale` for an extent
-    outside [5 mm, 2 m]. Other faults of the cloud raise `BadArgument` (`check_cloud`). Raises
-    `CloudFileError` for arrays of another shape or type.
+    outside [5 mm, 2 m]. Raises `BadArgument` for points on one line, a normal of length zero, or a
+    camera over 50 m away. Raises `CloudFileError` for arrays of another shape or type.
 
     >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))
     48

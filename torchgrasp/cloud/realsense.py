@@ -39,8 +39,8 @@ class DepthShot(NamedTuple):
 
     Attributes:
         depth: distance along the optical axis in counts, (h, w), integers; 0 is not measured.
-        intrinsics: the camera's own description of its pixels and its distortion, as
-            `cloud_from_depth` takes it.
+        intrinsics: the pixels and the distortion of the camera, a pyrealsense2.intrinsics. It is an
+            argument for `cloud_from_depth`.
         unit: metres of one count.
         camera: name and serial number.
     """
@@ -101,7 +101,10 @@ def import_sdk() -> Any:
 
 
 def list_cameras(sdk: Any) -> list[Any]:
-    """Return the connected devices of the module `sdk`, which is pyrealsense2."""
+    """Return the connected RealSense cameras, as objects pyrealsense2.device.
+
+    `sdk` is the module pyrealsense2.
+    """
     return list(sdk.context().query_devices())
 
 

@@ -45,8 +45,8 @@ class ViewDistanceNumbers:
     least: int = 20
     """Least number of compared points: fewer are a rim of flying pixels."""
     seen: float = 0.9
-    """How high a view stands in front of a surface is this quantile of its points' heights. Flying
-    pixels are higher.
+    """Quantile of the heights of a view's points in front of a surface that counts as the view's
+    height there. Flying pixels are higher.
     """
     same: float = 0.8
     """Least cosine of two normals that count as of one surface."""
@@ -190,10 +190,10 @@ def compare_views(views: Sequence[PointCloud]) -> list[float]:
 
 
 def compare_with(seen: PointCloud, view: PointCloud) -> float:
-    """Return the standard deviation [m] of a view's pose, estimated from what was seen before.
+    """Return the standard deviation [m] of the pose of a `view`, estimated from earlier views.
 
-    It is 0 if noise explains the distance of `seen` and `view`, or if they overlap too little. Both
-    clouds have normals and are in one frame [m]. Raises `BadArgument` for a view that is too far
+    The cloud `seen` holds these. The result is 0 if noise explains the distance of the two clouds,
+    or if they overlap too little. Both clouds have normals and are in one frame [m]. Raises `BadArgument` for a view that is too far
     off for its noise. Too far is a distance of 2.5 times the noise (`VIEWS.refused`), or a shift of
     3 times (`VIEWS.shifted`). A lesser distance that noise does not explain raises the warning
     `MendedInput`.
@@ -223,9 +223,11 @@ def _judge(distance: float, limit: float) -> tuple[float, float, float]:
 
 
 def align_views(views: Sequence[PointCloud]) -> list[tuple[Float[Tensor, "4 4"], float]]:
-    """Return a motion new_from_old (4, 4) [m] of each view, after which the views agree best.
-    Return also its standard deviation [m] along the surface's normals, as far as the overlap leaves
-    it open.
+    """Return for each view (motion, error): the motion new_from_old (4, 4) [m] after which the
+    views agree best, and its standard deviation [m].
+
+    The standard deviation is that of the points along their normals. It estimates the motion that
+    the overlap of the views does not show. A view that stays has the identity, and 0.
 
     The views [m] have normals and are in one frame. The first stays. Each other one is moved onto
     the views that are already placed. A motion that noise does not explain raises the warning

@@ -122,8 +122,9 @@ def parse_json(data: bytes) -> Any:
 
 
 def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
-    """Return the content of a .json, .yaml, .npy or .txt file of intrinsics, for
-    `cloud_from_depth`.
+    """Return a camera's intrinsics in a .json, .yaml, .npy or .txt file, for `cloud_from_depth`.
+
+    They are a dict, a list or an array, as the file holds them.
 
     BOP's scene_camera.json holds an entry for each image; `image` is its number as text, "" for
     other files. Errors call the argument `name`. Raises `BadArgument` for a file of another format,

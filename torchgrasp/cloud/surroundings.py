@@ -48,8 +48,9 @@ SURROUNDINGS = SurroundingNumbers()
 def find_surroundings(points: Points, normals: Points, table: Plane | None) -> float:
     """Return the share of points that are those of a table around an object; 0 if there is none.
 
-    The `normals` (n, 3) of the points (n, 3) [m] face the camera. With a `table` of None, planes
-    with many of the points are tried.
+    These points lie on the table, over 20 mm from the object's outline, and on most of its sides.
+    The `normals` (n, 3) of the points (n, 3) [m] face the camera. The `table` is in the frame of
+    the points. None means unknown: planes with many of the points are tried.
     """
     points = points.double().cpu()
     if table is not None:

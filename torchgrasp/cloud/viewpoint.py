@@ -28,13 +28,15 @@ class UnseenNumbers:
     neighbours: int = 6
     """Number of nearest points in the image with which a point is compared, itself included."""
     slope: float = 2.0
-    """Greatest slope of a surface, depth over width, that hides nothing."""
+    """Greatest slope of a surface, its depth divided by its width, that hides nothing."""
     step: float = 0.1
-    """Least step of depth behind which points are hidden, over the radius of the cloud."""
+    """Least step of depth behind which points are hidden, as a share of the cloud's radius."""
 
     def excess(self, shares: tuple[float, float]) -> tuple[float, float]:
-        """Return the shares of points seen edge-on and hidden behind others, each divided by its
-        bound.
+        """Return two shares of a view's points, each divided by its bound (`edge_on`, `behind`).
+
+        `shares` are those of the points seen edge-on, and hidden behind others (`share_unseen`). A
+        result above 1 means that the camera cannot have seen the points.
         """
         return shares[0] / self.edge_on, shares[1] / self.behind
 
@@ -67,7 +69,7 @@ class GuessNumbers:
     """Weight of the density in the score; that of the bulge is 1. It gave the fewest wrong cameras.
     """
     rival: float = 0.3
-    """Difference of score from the best direction up to which another direction is likely, too."""
+    """Difference from the best score up to which another direction is likely, too."""
     least_angle: float = 15.0
     """Least angle [deg] about the guessed direction within which the camera is likely."""
     sure: float = 1.0
@@ -157,12 +159,13 @@ def _is_ahead(points: Points, centre: Vector, radius: Float[Tensor, ""]) -> bool
 
 
 def can_see(points: Points, normals: Points, viewpoint: Vector) -> bool:
-    """Return whether a camera at `viewpoint` (3,) [m] can have taken a view.
+    """Return whether a camera at `viewpoint` (3,) [m] can have seen the points of a view.
 
-    From there, points must not hide other points. In addition, one of three conditions must hold.
-    First, the points are as dense as the camera's pixels. Second, no other place explains the
-    points much better. Third, the camera looks down on a support. `points` are (n, 3) [m];
-    `normals` (n, 3) are unit vectors of either sign.
+    It must see at most 15 % of them edge-on, and at most 20 % behind others (`UNSEEN`). In
+    addition, one of three conditions must hold. First, the camera's pixels explain how dense the
+    points are. Second, no other camera position explains the points much better. Third, the camera
+    looks down on a support. `points` are (n, 3) [m]; `normals` (n, 3) are unit vectors of either
+    sign.
     """
     points, normals = _draw(points, normals)
     if max(UNSEEN.excess(share_unseen(points, normals, viewpoint))) > 1:
@@ -220,6 +223,7 @@ def _explain(
 def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[float, float]:
     """Return the share of points that a camera sees edge-on, and the share hidden behind others.
 
+    A point is seen edge-on if its ray is at more than 80 degrees to the normal (`UNSEEN.grazing`).
     The second share is 1 if a point lies behind the camera at `viewpoint` (3,) [m]. `points` are
     (n, 3) [m]; `normals` (n, 3) are unit vectors of either sign.
     """
