@@ -38,11 +38,17 @@ class ArmNumbers:
     joints: int = 6
     """Least number of joints that can bring a hand to any pose."""
     postures: int = 1024
-    """Number of random postures in the library: one is not far from any pose."""
+    """Number of random postures in the library. They are so many that one brings the tip near to
+    any wanted pose.
+    """
     tested: int = 200
-    """Number of postures in which spheres are tested for overlap by construction."""
+    """Number of postures in which spheres of two links are tested for overlap. Links that touch in
+    nearly all of them do so by construction.
+    """
     cell: float = 0.065
-    """Edge [m] of a sphere's cell: one sphere fills a section of a thin link."""
+    """Edge [m] of the cells into which a link's shape is divided, one sphere for each. With this
+    edge, one sphere fills a section of a thin link.
+    """
     bulge: float = 0.01
     """Distance [m] by which a sphere may protrude from a shape."""
     mount: float = 1.0
@@ -196,11 +202,12 @@ class Arm(Value):
 
 
 def features(tip: TipPoses) -> Float[Tensor, "k 12"]:
-    """Return twelve numbers [mm] for each pose (3, 4); their Euclidean distance is a distance of
-    two poses.
+    """Return twelve numbers [mm] for each of k poses of an arm's tip, by which poses are compared.
 
-    For small rotations it is the length of two numbers: the translation [mm], and the angle [rad]
-    times 100 mm (`LEVER`).
+    The poses `tip` (3, 4, k) are in metres. The numbers are the position, then the entries of the
+    rotation matrix times 71 mm. Their Euclidean distance is a distance of two poses. For small
+    rotations it is sqrt(t^2 + (100 r)^2), with the translation t [mm] and the angle r [rad] between
+    the poses.
     """
     turn = LEVER / math.sqrt(2) * tip[:, :3].flatten(0, 1)
     return torch.cat([tip[:, 3] / MILLIMETRE, turn]).T

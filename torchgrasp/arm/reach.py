@@ -63,10 +63,11 @@ and the ease of the way, as in `Grasps`.
 
 
 def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
-    """Return a mask of the k hand poses `obj_from_hand` [m] that the arm reaches within its joint
-    limits.
+    """Return a mask (k,) of the k hand poses `obj_from_hand` [m] that the arm reaches within its
+    joint limits.
 
-    The poses are those of the hand's root link in the object's frame. Collisions are not tested.
+    Up to 4 postures of the arm's library are tried for each pose (`REACH.tried`). The poses are
+    those of the hand's root link in the object's frame. Collisions are not tested.
     """
     target = arm.tip_poses(obj_from_hand)  # (3, 4, k)
     reached = target.new_zeros(len(obj_from_hand), dtype=torch.bool)
@@ -155,12 +156,12 @@ def follow_grasps(
 def way_of(
     hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP
 ) -> Float[Tensor, "g w 4 4"]:
-    """Return w poses obj_from_hand [m] on the hand's way through each grasp: the straight approach,
-    then the lift.
+    """Return w poses obj_from_hand [m] on the hand's way through each of g grasps: the straight
+    approach, then the lift.
 
-    The opened hand approaches in the first half of the poses; the closed hand is lifted in the
-    second half. The lift is along the normal of the world's table, or along the unit vector `up`
-    without a table.
+    The poses are those of the hand's root link in the object's frame. The opened hand approaches in
+    the first half of the poses; the closed hand is lifted in the second half. The lift is along the
+    normal of the world's table, or along the unit vector `up` without a table.
     """
     closed = grasps.obj_from_hand
     opened = opened_pose(hand, grasps.pregrasp, closed, world.plane)
@@ -264,14 +265,14 @@ def solve_tips(
     steps: int = REACH.steps,
     solved: float = REACH.solved,
 ) -> tuple[Float[Tensor, "n k"], Bool[Tensor, "k"]]:
-    """Return postures moved within their limits until the tips are in place, then a mask of those
-    in place.
+    """Solve the arm's inverse kinematics: return k postures within the joint limits, and a mask
+    (k,) of those whose tip is in place.
 
     `start` holds a posture [rad or m] in each column. `target` holds the wanted poses (3, 4, k) [m]
     of the tip in the frame of the arm's root link. An error of rotation [rad] counts times 100 mm
     (`LEVER`). A tip is in place if the sum of its squared errors is below `solved` [mm2]. By
     default that is an error of a hundredth of a millimetre. A posture makes at most `steps` steps.
-    The damping is half the squared error (Sugihara, IEEE Transactions on Robotics 27, 2011).
+    The damping is half the squared error plus 1 (Sugihara, IEEE Transactions on Robotics 27, 2011).
     """
     joints = start.clone()
     rows = torch.arange(start.shape[1], device=start.device)

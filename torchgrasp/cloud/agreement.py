@@ -259,8 +259,8 @@ def check_stand(mesh: "trimesh.Trimesh", table: Plane, name: str = "mesh") -> No
 def noise_of(cloud: PointCloud) -> float:
     """Return the assumed standard deviation [m] of the depth noise of a cloud's camera.
 
-    It is the median over the points. The assumed noise grows with the squared distance from the camera. An unknown camera counts as
-    0.7 m away.
+    It is the median over the points. The assumed noise grows with the squared distance from the
+    camera. An unknown camera counts as 0.7 m away.
     """
     eye = None if cloud.viewpoint is None else cloud.viewpoint.double().cpu().reshape(-1, 3).mean(0)
     return float(assume_noise(cloud.points.double().cpu(), eye).median())

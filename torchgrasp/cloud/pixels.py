@@ -73,10 +73,11 @@ PIXELS = PixelNumbers()
 def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None:
     """Return the camera position (3,) [m] from which points form a regular lattice of pixels.
 
-    The points (n, 3) [m] and the result are in one frame. It is None if there is no such position, or for fewer than 100 points (`PIXELS.least`). From the
-    opposite side, the points form nearly the same lattice. So only cameras on the side of the
-    vector `up` are tried. If it is None, the side is the one to which the surface bulges. The
-    origin is tried first: there is the camera if the points are in its frame.
+    The points (n, 3) [m] and the result are in one frame. It is None without such a position,
+    or for fewer than 100 points (`PIXELS.least`). From the opposite side, the points form nearly
+    the same lattice. So only cameras on the side of the vector `up` are tried. If `up` is None, the
+    side is the one to which the surface bulges. The origin is tried first: there is the camera if
+    the points are in its frame.
     """
     if len(points) < PIXELS.least:
         return None
@@ -109,9 +110,10 @@ def irregularity(
 ) -> Float[Tensor, "c"]:
     """Return how irregularly a cloud's points are spaced as seen from each of c camera positions.
 
-    It has no unit. It is the mean deviation of the angles between neighbouring points from their median, divided by
-    this median. So it is about 0 for a regular lattice of pixels. `probes` are m points [m], and
-    `near` the k nearest points of each. The positions `eyes` [m] are in the same frame.
+    It has no unit. It is the mean deviation of the angles between neighbouring points from their
+    median, divided by this median. So it is about 0 for a regular lattice of pixels. `probes` are m
+    points [m], and `near` the k nearest points of each. The positions `eyes` [m] are in the same
+    frame.
     """
     found = list[Tensor]()
     for some in eyes.split(PIXELS.block):

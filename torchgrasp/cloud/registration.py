@@ -193,10 +193,10 @@ def compare_with(seen: PointCloud, view: PointCloud) -> float:
     """Return the standard deviation [m] of the pose of a `view`, estimated from earlier views.
 
     The cloud `seen` holds these. The result is 0 if noise explains the distance of the two clouds,
-    or if they overlap too little. Both clouds have normals and are in one frame [m]. Raises `BadArgument` for a view that is too far
-    off for its noise. Too far is a distance of 2.5 times the noise (`VIEWS.refused`), or a shift of
-    3 times (`VIEWS.shifted`). A lesser distance that noise does not explain raises the warning
-    `MendedInput`.
+    or if they overlap too little. Both clouds have normals and are in one frame [m]. Raises
+    `BadArgument` for a view that is too far off for its noise. Too far is a distance of 2.5 times
+    the noise (`VIEWS.refused`), or a shift of 3 times (`VIEWS.shifted`). A lesser distance that
+    noise does not explain raises the warning `MendedInput`.
     """
     one = _ViewSurface(seen)
     motion = _find_motion(one, _ViewSurface(view, one.noise))

@@ -55,11 +55,12 @@ WAYS = ((1.0, 0.0), (0.0, 1.0), (0.7, 0.7), (0.7, -0.7))
 def cut_creases(
     image: DepthImage, points: Float[Tensor, "h w 3"], pieces: Int[Tensor, "h w"]
 ) -> Int[Tensor, "h w"]:
-    """Return the number of the part to which each pixel belongs, 0 for none.
+    """Cut the pieces of a depth image along their concave creases; return each pixel's part.
 
-    Each piece, a number > 0 in `pieces` (h, w), is cut into parts along its concave creases. There
-    two surfaces meet, as those of touching objects do. `points` (h, w, 3) [m] are those of the
-    image, in the frame of its pose.
+    The result holds the number of the part, 0 for none. A piece holds the pixels with one number >
+    0 in `pieces` (h, w). At a concave crease two surfaces meet, as those of touching objects do.
+    Each part gets a number of its own. `points` (h, w, 3) [m] are those of the image, in the frame
+    "obj" to which its pose leads.
     """
     least = scale_pixels(CREASE.part, pieces)
     # from the camera, so that normals can face it

@@ -76,8 +76,10 @@ class DepthImage(Value):
     Attributes:
         depth: depth (h, w) [m] along the optical axis, 0 where nothing was measured.
         intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
-        obj_from_camera: pose (4, 4) [m] of the camera (x right, y down, z forward).
-        bounded: whether its border is the camera's; an image made of a cloud has none.
+        obj_from_camera: pose (4, 4) [m] of the camera (x right, y down, z forward) in the frame
+            "obj".
+        bounded: whether the border of the image is that of the camera's view. It is not in an image
+            made of a cloud.
     """
 
     depth: Float[Tensor, "h w"]
@@ -87,7 +89,7 @@ class DepthImage(Value):
 
     @property
     def focal(self) -> float:
-        """The focal length along a row [px]."""
+        """The focal length fx [px], along a row of pixels."""
         return float(self.intrinsics[0, 0])
 
     @property
@@ -191,9 +193,10 @@ def read_image(
 
 
 def scale_pixels(count: int, labels: Int[Tensor, "h w"]) -> float:
-    """Return the number of pixels in an image that corresponds to `count` of 640 x 480 pixels.
+    """Return the number of pixels that corresponds to `count` in an image of another size.
 
-    The image has the size of `labels` (h, w).
+    It is the same share of the image as `count` is of 640 x 480 pixels. The image has the size of
+    `labels` (h, w).
     """
     return count * labels.numel() / IMAGE.usual
 
@@ -201,8 +204,8 @@ def scale_pixels(count: int, labels: Int[Tensor, "h w"]) -> float:
 def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> Float[Tensor, "k"]:
     """Return the root mean square distance [m] of the points of each label from their mean.
 
-    Entry i of the result is for label i. `labels` holds the label of each of the h x w `points`
-    [m].
+    Entry i of the result is for label i, from 0 to the greatest one. `labels` holds the label of
+    each of the h x w `points` [m].
     """
     label = labels.reshape(-1)
     own = points.reshape(-1, 3)
@@ -216,12 +219,13 @@ def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> F
 def image_of_cloud(
     points: Points, viewpoint: Vector, up: Vector
 ) -> tuple[DepthImage, Int[Tensor, "n 2"]]:
-    """Return the depth image of a camera at the viewpoint, and the pixel of each point of a cloud.
+    """Return the depth image of a cloud, seen from its viewpoint, and the pixel (n, 2) of each
+    point.
 
-    A pixel (n, 2) is row and column. The camera is a pinhole, upright, and looks at the middle of
+    A pixel is row and column. The camera is a pinhole, upright, and looks at the middle of
     the points. A pixel covers about two points and keeps the nearest. `points` (n, 3) and
-    `viewpoint` (3,) are in metres; `up` (3,) is the unit vector that points up. Raises
-    `BadArgument` for points all around the camera.
+    `viewpoint` (3,) are in metres; `up` (3,) is the unit vector that points up. All are in one
+    frame. Raises `BadArgument` for points all around the camera.
     """
     forward = unit(unit(points - viewpoint).mean(0))
     down = -up + (up @ forward) * forward

@@ -30,9 +30,13 @@ class LeaningNumbers:
     objects: int = 5
     """Greatest number of objects whose sides are looked at, the largest ones."""
     low: float = 0.2
-    """Least height of points on a side, over that of the object: below, it blends into the table."""
+    """Least height of points on a side, as a share of the object's height. Lower points blend into
+    the table.
+    """
     high: float = 0.8
-    """Greatest height of these points, over that of the object: above, it has a rounded rim."""
+    """Greatest height of these points, as a share of the object's height. Higher ones may be on a
+    rounded rim.
+    """
     steep: float = 45.0
     """Greatest angle [deg] of a side to the vertical."""
     facing: float = 0.6

@@ -252,7 +252,8 @@ def _run_lengths(text: bytes) -> list[int]:
 def label_image(
     view: TableImage, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
 ) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
-    """Return the label of each pixel of a `view`, and notes, given labels, a mask or neither.
+    """Return the label (h, w) of each pixel of a `view`, and notes, a sentence each. Labels, a mask
+    or neither may be given.
 
     Given labels lose pixels on the table and flying pixels. Without labels the image is segmented.
     A mask becomes label 1, and loses strips of neighbouring objects, too. Pixels of the mask's
@@ -330,7 +331,9 @@ def _trim_labels(
 
 
 def without_masks(notes: tuple[str, ...], labels: tuple[int, ...]) -> tuple[str, ...]:
-    """Return the notes of `label_image` without those on the masks of `labels`."""
+    """Return those `notes` of `label_image` that do not tell of pixels removed from one of
+    `labels`.
+    """
     heads = tuple(f"{_mask_name(label)}:" for label in labels)
     return tuple(note for note in notes if not note.startswith(heads))
 
@@ -343,7 +346,8 @@ def label_again(
     given: tuple[int, ...],
     first: int,
 ) -> Int[Tensor, "h w"]:
-    """Return the label of each pixel after another support has replaced the former table.
+    """Return the label (h, w) of each pixel of a depth image after another support has replaced its
+    former table.
 
     The new `support` and the `former` table are in the frame of the image's pose. Labels that the
     user gave (`given`) lose pixels on the support. They gain pixels of their objects that the

@@ -66,12 +66,12 @@ class MergeNumbers:
     standing: float = 0.015
     """Height [m] of a body's foot below which the body stands on the table."""
     standing_share: float = 0.5
-    """Height of a body's foot, over that of its top, below which it stands, too: its foot is
-    hidden.
+    """Height of a body's foot, as a share of the height of its top, below which the body stands,
+    too: its true foot is hidden.
     """
     lesser: float = 0.1
-    """Greatest number of points of a part of another body, such as a knob, over that body's number
-    of points.
+    """Greatest number of points of a part of another body, such as a knob. It is a share of that
+    body's points.
     """
     upon: float = 0.01
     """Least height [m] of the top of a body over that of another one on which it lies."""
@@ -96,8 +96,8 @@ class MergeNumbers:
     hollow: float = 0.2
     """Share of high points in the middle from which on a body is not hollow."""
     handle: float = 0.7
-    """Size of a floating body, over its neighbour's, below which it may be a handle that is far
-    off.
+    """Ratio of the size of a floating body to its neighbour's. A smaller body may be a handle that
+    is far off.
     """
     from_above: float = 0.2
     """Least length, in the image, of the unit vector that points down. In a view from above no
@@ -121,10 +121,11 @@ MERGE = MergeNumbers()
 
 
 def merge_pieces(view: TableImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "k"]:
-    """Return the number of the object to which each piece belongs; 0 for none.
+    """Merge the pieces of a depth image to objects; return the number of each piece's object.
 
     A piece is a connected smooth surface of the image. Entry i of the result is for the piece with
-    the number i in `pieces` (h, w); 0 is no piece.
+    the number i in `pieces` (h, w). Objects count from 1. A piece of number 0 is no piece, and its
+    entry is 0.
     """
     new = torch.zeros(int(pieces.max()) + 1, dtype=torch.long)
     whole = torch.bincount(pieces.reshape(-1))
@@ -167,7 +168,8 @@ def _thinned(
 def find_touching(
     image: DepthImage, points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]
 ) -> list[tuple[int, int]]:
-    """Return the pairs of labels of objects that touch, so that the border between them is a guess.
+    """Return the pairs of labels of objects in an image that touch: the border between them is a
+    guess.
 
     Objects touch if the gap between their points is below 4 mm (half of `MERGE.gap`). `labels`
     holds the label of each of the h x w `points` [m] of the image, 0 for none.

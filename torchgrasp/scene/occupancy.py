@@ -121,10 +121,11 @@ class Shadows(Value):
     points: Float[Tensor, "h w 3"]
 
     def look(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """Return how far each of n points lies behind the measured depth, and its pixel's owner.
+        """Return how far each of n points lies behind the measured depth, and its pixel's `owner`.
 
-        The distance [m] is along the camera's ray, negative in front of the depth. The points [m]
-        are in the frame of the image's pose; the owner of one outside the image is -1.
+        The distance (n,) [m] is along the camera's ray, negative in front of the depth. The points
+        [m] are in the frame to which the image's pose leads. A point outside the image has the
+        owner -1, and its distance means nothing.
         """
         camera = apply(inverse(self.image.obj_from_camera.double()), points.double())
         x, y, z = camera.unbind(-1)
@@ -143,10 +144,10 @@ class Shadows(Value):
 
 
 def cast_shadows(scene: Scene, target: int) -> Shadows:
-    """Return the object that hides the space behind each pixel of a scene.
+    """Return the depth image of a scene, with the object that hides the space behind each pixel.
 
     The scene is in an upright frame with its table at z = 0. `target` is the label of an object;
-    unlabelled pixels at its rim are taken as its own.
+    unlabelled pixels within 6 px and 20 mm of it are taken as its own (`OCCUPANCY.rim`).
     """
     image = scene.image
     row, column = scene.pixels.unbind(-1)
@@ -177,18 +178,18 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
 def shadow_features(
     shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 6"]:
-    """Return the six features by which the model predicts whether points behind an object are
-    occupied.
+    """Return the six features by which a model predicts whether something occupies hidden points.
 
-    `points` (n, 3) [m] are in the upright frame of the scene, with z up; `owner` is the object's
-    number in `shadows`. The features are, in order:
+    The points are behind an object of the depth image. `points` (n, 3) [m] are in the upright frame
+    of the scene, with z up; `owner` is the object's number in `shadows`. The features are, in
+    order:
 
-    * The depth of the point behind the object's surface, over the object's width.
+    * The depth of the point behind the object's surface, divided by the object's width.
     * The depth [m] of the point below the object's visible points in the same vertical column.
     * Two distances [m] of the mirrored point behind the measured depth, for two guesses of the
       object's middle.
-    * The point's distance from the object's front, over the object's visible depth.
-    * The point's distance from the object's middle, over the object's width.
+    * The point's distance from the object's front, divided by the object's visible depth.
+    * The point's distance from the object's middle, divided by the object's width.
     """
     own = shadows.points[(shadows.owner == owner) & torch.isfinite(shadows.points[..., 2])]
     # (n, 2): along the view, and across it
@@ -234,12 +235,12 @@ def _tops(own: Float[Tensor, "m 3"], places: Float[Tensor, "n 2"]) -> Float[Tens
 
 @functools.cache
 def load_occupancy_model() -> dict[str, Any]:
-    """Return the model of each kind of space, by name: "target", "thing" and "unseen".
+    """Return the fitted models of how likely hidden space is occupied, one for each kind of space.
 
-    These are the spaces behind the target, behind another object, and where nothing was measured. A
-    model is a dict: "bias" is a number, "knots" and "values" hold one list for each feature. The
-    log-odds are "bias" plus one function of each feature, linear between its knots, where it has
-    its values.
+    Their names are "target", "thing" and "unseen". These are the spaces behind the target, behind
+    another object, and where nothing was measured. A model is a dict: "bias" is a number, "knots"
+    and "values" hold one list for each feature. The log-odds are "bias" plus one function of each
+    feature, linear between its knots, where it has its values.
     """
     return json.loads(MODEL.read_text("utf-8"))
 

@@ -259,9 +259,10 @@ class Scene(Value):
     ) -> "Scene":
         """Return the scene that a point cloud of one view shows.
 
-        The points are projected to a depth image of a pinhole camera at the cloud's viewpoint.
-        Objects are found in it as in `from_depth`. A `mask`, a `box` or a `point` chooses the
-        target; without them there is none. The frame of the cloud is "obj".
+        The points are projected to a depth image of a pinhole camera at the cloud's viewpoint. The
+        objects are those of `labels`. Without labels they are the connected components above the
+        table. A `mask`, a `box` or a `point` chooses the target; without them there is none. The
+        frame of the cloud is "obj".
 
         Args:
             cloud: everything that the camera saw, n points [m], with the camera's viewpoint (3,).

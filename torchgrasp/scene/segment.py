@@ -27,11 +27,13 @@ class SegmentNumbers:
     """
 
     risen: float = 2.5
-    """Least mean height of an object's pixels, in deviations of the table's noise."""
+    """Least mean height of an object's pixels, in standard deviations of the table's noise."""
     least_height: float = 0.002
     """Least mean height of an object's pixels [m], however small the noise."""
     own: float = 0.6
-    """Least height of a pixel itself, over the least mean height around it."""
+    """Least height of an object's pixel itself, as a share of the least mean height around it
+    (`risen`, `least_height`).
+    """
     near: float = 0.005
     """Distance [m] from an object within which a pixel at a jump of depth joins it."""
     near_pixels: float = 4.0
@@ -84,11 +86,12 @@ NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0))
 
 
 def segment(view: TableImage) -> Int[Tensor, "h w"]:
-    """Return the label of each pixel: 1, 2, ... for objects, the largest first, and 0 for none.
+    """Return the label of each pixel of a depth image that is cut into objects on a table.
 
-    A piece is a connected component of the pixels above the table. It has no jump of depth and no
-    crease. Pieces of one object are merged. Pixels at jumps go to the object whose surface they lie
-    on, if there is one. Pixels beside the region of the support get 0.
+    Labels are 1, 2, ... for objects, the largest first, and 0 for none. A piece is a connected
+    component of the pixels above the table. It has no jump of depth and no crease. Pieces of one
+    object are merged. Pixels at jumps go to the object whose surface they lie on, if there is one.
+    Pixels beside the region of the support get 0.
     """
     smooth = view.smooth
     risen = _risen(view)
@@ -133,7 +136,8 @@ def _are_things(view: TableImage, pieces: Tensor, sure: Tensor) -> Bool[Tensor, 
 def rests_on(view: TableImage) -> Bool[Tensor, "h w"]:
     """Return a mask of the pixels that are above the table and on the surface of an object.
 
-    Flying pixels are left out.
+    A pixel beside a jump of depth must be near another pixel on a surface. Near is within 5 mm, or
+    4 widths of a pixel if that is more (`SEGMENT`). So flying pixels are left out.
     """
     risen = _risen(view)
     near = (SEGMENT.near_pixels * view.image.depth / view.image.focal).clamp_min(SEGMENT.near)
@@ -154,8 +158,8 @@ def at_one_jump(view: TableImage) -> Bool[Tensor, "h w"]:
     """Return a mask of the pixels above the table that may lie on thin bars, beside a jump of
     depth.
 
-    `rests_on` misses such pixels. Flying pixels, between a nearer and a farther surface, are left
-    out.
+    The depth jumps back or forward beside them, but not both. `rests_on` misses such pixels. Flying
+    pixels, between a nearer and a farther surface, are left out.
     """
     before_jump, behind_jump = _jumps(view.smooth)
     return _risen(view) & ~(before_jump & behind_jump)
@@ -181,8 +185,9 @@ def _jumps(smooth: TableImage) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]
 
 
 def find_components(smooth: TableImage, core: Tensor) -> Int[Tensor, "h w"]:
-    """Return the number, from 1, of each pixel's connected component in the mask `core`; 0 outside
-    of the mask. A jump of depth separates components.
+    """Return the number, from 1, of each pixel's connected component in the mask `core` (h, w).
+
+    It is 0 outside of the mask. A jump of depth in the image `smooth` separates components.
     """
     h, w = core.shape
     depth = smooth.image.depth
@@ -259,7 +264,10 @@ def _widened(box: tuple[slice, slice], margin: int) -> tuple[slice, slice]:
 
 
 def count_labels(labels: Tensor, length: int = 0) -> Int[Tensor, "k"]:
-    """Return the number of pixels of each label 0, 1, ..., with zeros up to `length` numbers."""
+    """Return the number of pixels of each label 0, 1, ... up to the greatest one.
+
+    If `length` is larger, the result has as many entries, the last of them 0.
+    """
     return torch.bincount(labels.reshape(-1), minlength=length)
 
 

@@ -32,7 +32,7 @@ class HeightNumbers:
     causes.
     """
     slope: float = 2.0
-    """Largest change of depth of one surface from pixel to pixel, over a pixel's width."""
+    """Largest change of depth of one surface from pixel to pixel, in widths of a pixel."""
     least_share: float = 1e-9
     """Least share of averaged pixels that is a divisor, so that nothing is divided by 0."""
 
@@ -56,7 +56,11 @@ class TableImage(Value):
 
     @classmethod
     def of(cls, image: DepthImage, support: SupportPlane) -> "TableImage":
-        """Return the table image of a depth image and a support; its points are computed."""
+        """Return the table image of a depth image and the support of its objects.
+
+        The points of the pixels are computed from the depth. The `support` is in the frame to which
+        the image's pose leads.
+        """
         return cls(image, image.points(), support)
 
     @property
@@ -103,10 +107,10 @@ class TableImage(Value):
 
     @kept
     def median_noise(self) -> float:
-        """The standard deviation of mean heights divided by the squared depth [1/m], estimated by a
-        median.
+        """The standard deviation [1/m] of the table's noise, divided by the squared depth.
 
-        A few outliers do not move it. It is 0 if no pixel shows the table.
+        It is 1.4826 times the median of |mean height| / depth^2 over the pixels on the table
+        (`flat`). A few outliers do not move it. It is 0 if no pixel shows the table.
         """
         if not bool(self.flat.any()):
             return 0.0
@@ -115,17 +119,19 @@ class TableImage(Value):
 
     @kept
     def fitted_noise(self) -> Float[Tensor, "h w"]:
-        """The standard deviation [m] of mean heights at each pixel's depth, by a model fitted to
-        the table.
+        """The standard deviation [m] of the mean height of a table, at each pixel's depth.
 
-        The model is `SensorNoise.sigma`: a constant part and one that grows with the squared depth.
+        It is that of a model fitted to the pixels on the table (`SensorNoise.sigma`). The model has
+        a constant part, and one that grows with the squared depth.
         """
         depth = self.image.depth
         return fit_noise(depth[self.flat], self.mean_height[self.flat]).sigma(depth)
 
     @kept
     def jump(self) -> Float[Tensor, "h w"]:
-        """The least difference in depth [m] that counts as a jump to another surface, at each
-        pixel.
+        """The least difference in depth [m], at each pixel, that counts as a jump to another
+        surface.
+
+        It is 6 mm (`HEIGHT.jump`) plus twice the width of the pixel at its depth (`HEIGHT.slope`).
         """
         return HEIGHT.jump + HEIGHT.slope * self.image.depth / self.image.focal
