@@ -25,7 +25,11 @@ from torchgrasp.values.planning import Grasps
 
 @dataclasses.dataclass(frozen=True)
 class ReachNumbers:
-    """Numbers of an arm's inverse kinematics and of its way through a grasp."""
+    """Numbers of an arm's inverse kinematics and of its way through a grasp.
+
+    Steps are those of the inverse kinematics' solver. A way leads the hand through a straight
+    approach, the grasp and the lift.
+    """
 
     tried: int = 4
     """Number of postures of the library from which a pose is tried."""

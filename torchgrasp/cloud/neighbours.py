@@ -95,7 +95,7 @@ def find_inliers(points: Points, rows: Int[Tensor, "m"] | None = None) -> Bool[T
 
 @dataclasses.dataclass(frozen=True)
 class Neighbours:
-    """Inliers, local planes and local quadrics of a cloud, each found once and then kept.
+    """Inliers, local planes and local quadric surfaces of a cloud, each found once and then kept.
 
     They follow from the nearest neighbours of each of n points. Lengths have the unit of the
     points.

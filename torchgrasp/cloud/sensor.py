@@ -360,11 +360,12 @@ def estimate_noise(
     table: Plane,
     on_table: Bool[Tensor, "h w"],
 ) -> SensorNoise | None:
-    """Return the noise that a table shows; None if fewer than 1000 pixels show the table.
+    """Return a model of a camera's noise, estimated from a depth image of a table.
 
-    The fields `floor` [m] and `growth` [1/m] are its random part (`fit_noise`). `bias` [m] is its
-    smooth part. The depth (h, w) is in metres, the intrinsics are in pixels, and the plane is in
-    the camera's frame. Of the pixels `on_table`, those over 20 mm from the plane do not count.
+    It is None if fewer than 1000 pixels show the table. The fields `floor` [m] and `growth` [1/m]
+    are its random part (`fit_noise`). `bias` [m] is its smooth part. The depth (h, w) is in metres,
+    the intrinsics are in pixels, and the plane is in the camera's frame. Of the pixels `on_table`,
+    those over 20 mm from the plane do not count.
     """
     row, column = (torch.arange(n, dtype=torch.float64) for n in depth.shape)
     x = (column - intrinsics[0, 2]) / intrinsics[0, 0]

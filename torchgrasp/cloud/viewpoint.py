@@ -97,15 +97,17 @@ GUESS = GuessNumbers()
 def guess_viewpoint(
     points: Points, normals: Points, up: Vector | None = None, assumed: bool = False
 ) -> tuple[Vector, float]:
-    """Return a camera position [m] that explains a view, and the angle [deg] of its uncertainty.
+    """Return an estimated camera position (3,) [m] of a view, and the angle [deg] of its
+    uncertainty.
 
-    The camera is likely within this angle; 180 degrees means that the points hardly show the
-    direction.
+    The camera's direction is likely within this angle of the estimate; 180 degrees means that the
+    points hardly show the direction.
 
     First the origin is tried. It is returned if the points lie before it along z, and a camera
     there can have seen them. If `up` is known, the points must also lie below the origin. Else the
-    direction is searched: of all directions above the support, the one that explains the points
-    best. The camera is placed along it, 4 radii of the cloud away.
+    direction is searched: of all directions above the support, the one that best explains the bulge
+    of the surface and the density of the points. The camera is placed along it, 4 radii of the
+    cloud away.
 
     Args:
         points: the points (n, 3) [m].

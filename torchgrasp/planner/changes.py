@@ -28,7 +28,8 @@ class ChangeNumbers:
     tried: int = 2
     """Greatest number of frictions that are tried."""
     variances: tuple[float, ...] = (0.03, 0.1)
-    """Greatest variances of the surface at a contact that are tried, in squared normalised units.
+    """Greatest variances of the surface's distance at a contact that are tried. They are in squared
+    normalised units; such a unit is half the object's size.
     """
     flatnesses: tuple[float, ...] = (0.44, 0.9)
     """Greatest angles [rad] between the normals at a contact and on a ring around it that are
@@ -83,14 +84,15 @@ def _with(request: Request, **fields: Any) -> Request:
 def list_changes(request: Request) -> list[Change]:
     """Return all changes of a request, each of one setting, that could give grasps.
 
-    A change to more initial guesses, which `more_starts` makes, is not among them.
+    They concern regions and loads, the surroundings, the fingers, limits of contacts, the friction,
+    and other hands. A change to more initial guesses (`more_starts`) is not among them.
     """
     kinds = (_regions, _surroundings, _fingers, _limits, _friction, _hands)
     return [change for kind in kinds for change in kind(request)]
 
 
 def more_starts(request: Request, ratio: int) -> Change:
-    """Return the change to `ratio` times as many initial guesses as the request has."""
+    """Return a change of the request: to `ratio` times as many initial guesses as it has."""
     more = dataclasses.replace(request, starts=ratio * request.starts)
     return Change(f"with {more.starts} starts", True, frozenset(Status), more)
 

@@ -66,7 +66,7 @@ class DragNumbers:
     rim: float = 0.002
     """Least distance [m] of a pressing tip from the outline of the object's top."""
     ring: int = 8
-    """Number of points on the circle of this radius about a tip that must lie on the object's top.
+    """Number of points on the circle of radius `rim` about a tip that must lie on the object's top.
     """
     flat: float = 0.003
     """Largest difference [m] of heights on this circle."""
@@ -251,7 +251,11 @@ class EdgeBalance:
 
     @classmethod
     def of(cls, object_: ShapedObject, table: Plane) -> "EdgeBalance":
-        """Return the balance of an object; `table` has an edge, in the frame of the cloud."""
+        """Return where an object's weight acts, and how far the object may go over its table's
+        edge.
+
+        The `table` has an edge, and is in the frame of the cloud.
+        """
         assert table.edge is not None
         centre = centre_of_mass(object_)
         edge = inverse(object_.obj_from_upright)[:3, :3] @ table.edge.normal

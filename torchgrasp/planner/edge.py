@@ -43,7 +43,7 @@ class EdgePlan(Value):
 
     Attributes:
         drag: the drag; None if there is none, for which `reason` tells why.
-        grasps: grasps of the object after the drag, or of the object where it stands without one.
+        grasps: grasps of the object after the drag; without a drag, of the object where it stands.
             They are in the frame of the cloud, the best first, as those of `plan_grasps`. Their
             metadata hold the drag (`torchgrasp.planner.drag_of`), so that one file has both.
         shape: the estimated shape after the drag, in the same frame.
@@ -59,11 +59,11 @@ class EdgePlan(Value):
 
     @property
     def success(self) -> float:
-        """The predicted success of the first grasp, in [0, 1], times the success rate of drags.
+        """The predicted success, in [0, 1], of the drag and the first grasp together.
 
-        The rate is the share of simulated drags that ended as planned (`DRAG.ended`). The result is
-        0 without an executable grasp, one that passed all checks, and NaN if its success is
-        unknown.
+        It is that of the grasp, times 0.85 if there is a drag (`DRAG.ended`). So many simulated
+        drags ended as planned. The result is 0 without an executable grasp, one that passed all
+        checks. It is NaN if the grasp's success is unknown.
         """
         good = self.grasps.executable
         if not len(good):

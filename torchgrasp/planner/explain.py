@@ -48,8 +48,8 @@ class ExplainNumbers:
     enough: float = 0.8
     """Expected success from which on a change is good enough to end the search."""
     beside: float = 0.2
-    """Weight of a stage's other failures, in [0, 1], as a failed set reports only one of its
-    failures.
+    """Weight, in [0, 1], of those failures of a stage that a change does not prevent. A failed set
+    reports only one of its failures, so the change may help there, too.
     """
     least: float = 0.25
     """Least weight of a change that is tried, as a share of the greatest weight."""
@@ -60,13 +60,15 @@ EXPLAIN = ExplainNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Losses(Value):
-    """How many of the things given to a planning stage were lost, and for which reasons.
+    """How many candidates for a grasp one planning stage lost, and for which reasons.
+
+    A candidate is an initial guess, a contact set or a hand posture, by the stage.
 
     Args:
         stage: name of the stage.
-        things: word for what the stage was given, such as "contacts".
-        given: number of things that the stage was given.
-        lost: number of things lost, by reason, the most frequent first.
+        things: word for the candidates that the stage was given, such as "contacts".
+        given: number of candidates that the stage was given.
+        lost: number of lost candidates for each reason, the most frequent reason first.
     """
 
     stage: str
@@ -76,7 +78,7 @@ class Losses(Value):
 
     @property
     def kept(self) -> int:
-        """The number of things that the stage was given and did not lose."""
+        """The number of candidates that the stage was given and did not lose."""
         return self.given - sum(self.lost.values())
 
     @property
@@ -106,7 +108,7 @@ class Funnel(Value):
     @classmethod
     @checked
     def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
-        """Return the losses, counted in the results of four planning stages.
+        """Return the losses of the three stages, counted in the results of planning.
 
         `plan` holds the planned contact sets, and `closed` the certificates of those with force
         closure. `seeds` holds the initial hand postures for these, and `grasps` the checked grasps.
@@ -123,7 +125,7 @@ class Funnel(Value):
 
     @property
     def executable(self) -> int:
-        """The number of executable grasps."""
+        """The number of executable grasps, which passed all checks."""
         return self.stages[-1].kept
 
     @property
@@ -141,8 +143,10 @@ class Funnel(Value):
 
     @checked
     def share(self, reasons: frozenset[Status]) -> float:
-        """Return the sum over the stages of the share of the stage's input that was lost for the
-        given `reasons`.
+        """Return the share of candidates that each stage lost for the given `reasons`, summed over
+        the stages.
+
+        The share is that of the candidates which the stage was given. A sum may exceed 1.
         """
         shares = (
             n / stage.given
@@ -423,13 +427,13 @@ def try_request(
     known: Objects | None = None,
     first: Observer | None = None,
 ) -> tuple[Funnel, float, Objects]:
-    """Return losses, expected success and object of a plan with a small library of postures.
+    """Plan a request with a small library of postures; return (losses, expected success, object).
 
-    The expected success, in [0, 1], is the mean predicted success of the best grasps. They are one
-    for every 5 initial guesses (`EXPLAIN.judged`). Several sets of fingers share the initial
-    guesses; losses and success are those of the best set. If no contact set is found, the most
-    relaxed constraints are tried, too. The returned object is prepared for the last set of fingers
-    (`pose`).
+    The losses are how many candidates each planning stage lost. The expected success, in [0, 1], is
+    the mean predicted success of the best grasps. They are one for every 5 initial guesses
+    (`EXPLAIN.judged`). Several sets of fingers share the initial guesses; losses and success are
+    those of the best set. If no contact set is found, the most relaxed constraints are tried, too.
+    The returned object is prepared for the last set of fingers (`pose`).
 
     Args:
         request: the arguments of the plan.

@@ -89,12 +89,13 @@ EASE = EaseNumbers()
 
 @checked
 def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> dict[int, Status]:
-    """Return the first reason why the hand cannot grasp each object of a scene, or `Status.OK`, by
-    the object's label.
+    """Return for the label of each object of a scene why the hand cannot grasp it, or `Status.OK`.
 
-    The objects are judged from the depth image alone, without planning, in milliseconds. Reasons
-    are `FEW_PIXELS`, `OFF_TABLE`, `CUT_OFF`, `NO_DEPTH`, `TOO_LOW` and `TOO_WIDE`. `spec` holds the
-    constraints on contacts; None means `ContactSpec()`.
+    The objects are judged from the depth image alone, without planning, in milliseconds. The first
+    reason that holds is returned. The reasons are: few pixels (`FEW_PIXELS`), not over the table
+    (`OFF_TABLE`), cut off by the image's border (`CUT_OFF`), mostly without depth (`NO_DEPTH`). The
+    object may also be too low for the fingertips (`TOO_LOW`), or wider than the hand spans
+    (`TOO_WIDE`). `spec` holds the constraints on contacts; None means `ContactSpec()`.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> set(judge_things(load_scene(), load_hand("barrett")).values()) == {Status.OK}
@@ -191,8 +192,8 @@ def hand_span(hand: Hand) -> float:
     """Return the span [m] of a hand: the largest distance of two fingertip pads that face each
     other.
 
-    Pads face each other if the line between them lies in the cones of both. The span is found among
-    random postures, the same in every call.
+    A pad may touch within a cone about its normal. Pads face each other if the line between them
+    lies in both cones. The span is found among random postures, the same in every call.
     """
     if "span" not in hand.derived:
         generator = torch.Generator().manual_seed(0)
@@ -225,8 +226,8 @@ def order_by_ease(scene: Scene) -> list[int]:
     An object is easy if it is tall, has free space around it, and has nothing above it. The camera
     should be so near that a pixel on the object is smaller than a contact. It should see more of
     the object than fingertips cover. The object's outline in the image should be convex. Otherwise
-    it may be partly hidden, or be two objects that touch. Objects that are larger than all objects
-    in our trials, or that the image border cuts off, come last.
+    it may be partly hidden, or be two objects that touch. Objects that the image border cuts off
+    come last. So do objects larger than any in the trials from which success is predicted.
     """
     points, labels = (x.numpy() for x in _stand_upright(scene))
     # one point of each object in a cell is enough

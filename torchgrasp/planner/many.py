@@ -166,7 +166,10 @@ def _refused(hand: Hand, reason: str) -> Grasps:
 
 
 def no_grasps(hand: Hand) -> Grasps:
-    """Return 0 grasps; their empty tensors have the axes of the hand's joints and fingers."""
+    """Return a `Grasps` that holds no grasp of the hand.
+
+    Its empty tensors have axes of the hand's joints and fingers.
+    """
     f = len(hand.tips)
 
     def none(*shape: int) -> torch.Tensor:

@@ -155,7 +155,7 @@ class ShapedObject:
 
 @dataclasses.dataclass(frozen=True)
 class Objects:
-    """A batch of c posed objects for one hand and one request.
+    """A batch of c objects, each in its upright frame (z up), ready to be planned for one hand.
 
     The fields from `shape` on hold one value for each object, or the value of a single object.
 
@@ -163,10 +163,11 @@ class Objects:
         request: the arguments of the plan.
         hand: the hand, on the device of the objects.
         given_spec: the constraints on contacts in the caller's frame.
-        specs: the constraints of each object in its upright frame, with a known flat radius.
+        specs: the constraints on contacts of each object in its upright frame. Their radius within
+            which a contact must be flat is a number, not None.
         each: the c objects with their shapes.
         sizes: the sizes of the plan's batches.
-        starts: the s initial guesses of each object (s, f, 3), normalised.
+        starts: the s initial guesses of f contacts (s, f, 3) for each object, in normalised units.
         shape: the estimated shapes.
         constraints: the contact planning problem (`ContactProblem`), in normalised units.
         body: the bodies for predictions of success.
@@ -207,13 +208,18 @@ class Objects:
 
     @property
     def spec(self) -> ContactSpec:
-        """The constraints of the first object; the others differ only in the flat radius."""
+        """The constraints on contacts of the first object, in its upright frame.
+
+        Those of the others differ only in the radius within which a contact must be flat.
+        """
         return self.specs[0]
 
     @property
     def slipping(self) -> ContactSpec:
-        """The constraints of the first object, with the whole mean friction as planned friction
-        (`friction_margin` 1).
+        """The constraints on contacts of the first object, but planned with the whole mean
+        friction.
+
+        Other constraints use only a share of it, their `friction_margin`; here it is 1.
         """
         return dataclasses.replace(self.spec, friction_margin=1.0)
 
@@ -270,13 +276,14 @@ class Objects:
     def relaxed_specs(self) -> Iterator[ContactSpec]:
         """Yield ever weaker constraints on contacts of a single object, in the caller's frame.
 
-        They are those of `ContactSpec.relaxed`: first with smaller flat radii.
+        They are those of `ContactSpec.relaxed`. First the radius shrinks within which the surface
+        at a contact must be flat.
         """
         radius = float(self.hand.tips.radius.max())
         return iter(self.given_spec.relaxed(self.spec.ring_radius, radius))
 
     def relaxed(self, spec: ContactSpec) -> "Objects":
-        """Return the same single object with relaxed constraints, one of `relaxed_specs`.
+        """Return the same single object with the constraints `spec`, one of `relaxed_specs`.
 
         The hand may then move down while it closes.
         """
@@ -287,10 +294,11 @@ class Objects:
     def reach(
         self, contacts: Contacts, certificate: Certificate, cloud: CloudIndex
     ) -> GraspProblem:
-        """Return the inverse-kinematics problem of b contact sets with their certificates.
+        """Return the inverse-kinematics problem of bringing the fingertips to each of b contact
+        sets.
 
-        Contacts [m] are in the upright frame. `cloud` (b,) is the index of each contact set's
-        object.
+        Contacts [m] are in the upright frame, and `certificate` proves their force closure. `cloud`
+        (b,) is the index of each contact set's object.
         """
         center = self.body.rows(cloud).center
         world = self.world.rows(cloud)
@@ -309,7 +317,7 @@ class Objects:
         )
 
     def on_arm(self, grasps: Grasps) -> Grasps:
-        """Return the grasps, with the arm's postures if there is an arm.
+        """Return the grasps, with the arm's posture at each grasp if there is an arm.
 
         The arm must follow approach and lift within its limits and without a collision. Executable
         grasps for which it cannot get the status `UNREACHABLE`.
@@ -332,10 +340,11 @@ class Objects:
             self.request.observer(stage, message, self._moved(value))
 
     def give_back(self, grasps: Grasps) -> Grasps:
-        """Return grasps, given in the upright frame, in the caller's frame and on the device of its
-        cloud. The batch must hold a single object.
+        """Return grasps of the upright frame in the caller's frame, on the device of the caller's
+        cloud.
 
-        The result's `meta` names the frames, units and inputs of the plan.
+        The batch must hold a single object. The result's `meta` names the frames, units and inputs
+        of the plan.
         """
         request = self.request
         spec = self.given_spec
@@ -458,8 +467,9 @@ def pose(
 
 
 def join_objects(parts: Sequence[Objects], device: torch.device) -> Objects:
-    """Return single objects, which `pose` has prepared, as one batch on a device. They must not be
-    in scenes.
+    """Return single objects as one batch of objects on a device.
+
+    Each has been prepared by `pose` for one hand. None may be in a scene.
     """
     first = parts[0]
     shape = ShapeBatch.of([part.each[0].shape for part in parts], device)
@@ -560,6 +570,8 @@ def take_target(scene: Scene, seed: Seed) -> PointCloud:
 
 
 def digest(cloud: PointCloud) -> str:
-    """Return the SHA-256 of a cloud's points; the metadata of grasps identify the cloud by it."""
+    """Return the SHA-256 of a cloud's points in hexadecimal. The metadata of grasps identify the
+    cloud by it.
+    """
     points = cloud.points.detach().cpu().double().contiguous().numpy()
     return hashlib.sha256(points.tobytes()).hexdigest()

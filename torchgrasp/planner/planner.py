@@ -47,12 +47,11 @@ steps.
 
 
 def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:
-    """Yield for each batch a list with the grasps of each object, executable ones first.
+    """Yield lists with the grasps of each object, one list for each batch of initial guesses.
 
-    A batch has some of the initial guesses.
-
-    The grasps are in the upright frame. Their `meta` says how many initial guesses were planned so
-    far. No batch begins after `deadline` [s], a time of `time.monotonic`.
+    Executable grasps come first. The grasps are in the upright frame. Their `meta` says how many
+    initial guesses were planned so far. No batch begins after `deadline` [s], a time of
+    `time.monotonic`.
     """
     sizes = objects.sizes
     drawn = draw(objects, [size.starts for size in sizes if size.starts])
@@ -120,7 +119,7 @@ def step(
 def try_first(
     objects: Objects, rows: Candidates, fresh: Int[Tensor, "k"]
 ) -> tuple[Candidates, Int[Tensor, "e"]]:
-    """Solve for the hand on fixed contacts with few solver steps, for an early grasp.
+    """Solve for the hand on fixed contacts with at most 8 solver steps, for an early grasp.
 
     `rows` are all contact sets, and `fresh` holds the indices of those to try. Return `rows` with
     the new states and grasps, then the indices of the sets whose search ended. A set with an
@@ -166,10 +165,10 @@ def try_fully(
 
 
 def without(rows: Candidates, solved: Int[Tensor, "k"], clouds: int) -> Bool[Tensor, "c"]:
-    """Return a mask (c,) of the objects of which no contact set is in `solved`.
+    """Return a mask (c,) of the objects of which no contact set is solved.
 
-    `rows` are all contact sets, `solved` holds indices of some, and `clouds` is the number c of
-    objects.
+    `rows` are all contact sets, and `solved` holds the indices of the solved ones. `clouds` is the
+    number c of objects.
     """
     return torch.bincount(rows.cloud[solved], minlength=clouds) == 0
 
@@ -214,9 +213,11 @@ def solve_with_sliding(
 
 
 def solve_all(objects: Objects, rows: Candidates) -> Grasps:
-    """Return the grasps of all contact sets `rows`, executable ones first.
+    """Return the grasps of all contact sets `rows`, executable ones first, in a mode other than
+    "joint".
 
-    The mode "paper" uses `solve_as_paper`, the mode "contact_first" `solve_contact_first`.
+    The mode "paper" solves as the paper's method does. The mode "contact_first" refines postures of
+    the learned model onto fixed contacts.
     """
     reach = objects.reach(rows.contacts, rows.certificate, rows.cloud)
     solve = solve_as_paper if objects.request.mode == "paper" else solve_contact_first

@@ -39,11 +39,12 @@ of a view.
 def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
     """Return for each object its grasps, best first, on the CPU.
 
-    The best grasp has the greatest predicted success, or the least variance (`Request.order`). A
-    grasp's `score` is the log-odds of its success. `cloud` (g,) is the index of each grasp's
-    object. If the object cannot be lifted out of its surroundings, its grasps get the status
-    `BURIED`. Grasps that the arm cannot follow get `UNREACHABLE`, and grasps that resist less than
-    the loads `NOT_RESISTED`. Grasps of less success than a promise needs get `NO_PROMISE`.
+    The best grasp has the greatest predicted success, or the least variance of the surface at its
+    contacts (`Request.order`). A grasp's `score` is the log-odds of its success. `cloud` (g,) is
+    the index of each grasp's object. If the object cannot be lifted out of its surroundings, its
+    grasps get the status `BURIED`. Grasps that the arm cannot follow get `UNREACHABLE`, and grasps
+    that resist less than the loads `NOT_RESISTED`. Grasps of less success than a promise needs get
+    `NO_PROMISE`.
     """
     request = objects.request
     if objects.buried:
@@ -72,13 +73,14 @@ def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
 def predict(
     objects: Objects, grasps: Grasps, cloud: CloudIndex
 ) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"]]:
-    """Return the log-odds (g,) of success of g grasps. Return then the share (g,) of the conditions
-    for which similar grasps were tried.
+    """Return two numbers for each of g grasps: the log-odds of its success, and how far trials
+    cover it.
 
-    The conditions are the distributions of friction and mass; the success is the mean over them.
-    Its log-odds fall by 2.1 (`UNCARRIED`) where the fingers cannot carry the mean weight with the
-    mean friction. With obstacles, success also needs that the hand hits none. `cloud` (g,) is the
-    index of each grasp's object.
+    The second is the share, in [0, 1], of the conditions for which similar grasps were tried. The
+    conditions are the distributions of friction and mass; the success is the mean over them. Its
+    log-odds fall by 2.1 (`UNCARRIED`) where the fingers cannot carry the mean weight with the mean
+    friction. With obstacles, success also needs that the hand hits none. `cloud` (g,) is the index
+    of each grasp's object.
     """
     task = objects.request.grasp_task
     spec = objects.spec
@@ -111,9 +113,10 @@ def predict(
 def prove_resistance(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> Grasps:
     """Return the grasps, with the proof of the loads that they resist in their certificates.
 
-    The proof is in the fields `task_margin` to `task_strength` of `Certificate`. Executable grasps
-    with a `task_margin` below 1 get the status `NOT_RESISTED`. Without loads to resist the grasps
-    are returned as they are. `cloud` is the index of each grasp's object.
+    The proof is in the fields `task_margin` to `task_strength` of `Certificate`. The `task_margin`
+    is the greatest multiple of the loads that a grasp resists. Executable grasps with a margin
+    below 1 get the status `NOT_RESISTED`. Without loads to resist the grasps are returned as they
+    are. `cloud` is the index of each grasp's object.
     """
     if objects.loads is None:
         return grasps
@@ -131,8 +134,10 @@ def prove_resistance(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> Gra
 
 
 def rank_together(batches: Sequence[Grasps], ranking: Ranking) -> Grasps:
-    """Return the grasps of all batches in the order `ranking`, executable ones first, with the last
-    batch's metadata.
+    """Return the grasps of all batches in one order, the executable ones first.
+
+    `ranking` puts those of the greatest predicted "success" first, or of the least "variance". The
+    result has the metadata of the last batch.
     """
     ranked = by_success(join(batches))
     ranked = ranked if ranking == "success" else rank_by_variance(ranked)
@@ -140,7 +145,8 @@ def rank_together(batches: Sequence[Grasps], ranking: Ranking) -> Grasps:
 
 
 def expected_success(grasps: Grasps, best: int = BEST) -> float:
-    """Return the mean predicted success, in [0, 1], of the `best` best executable grasps.
+    """Return the mean predicted success, in [0, 1], of the `best` (by default 20) best executable
+    grasps.
 
     Each grasp that is missing counts as 0.
     """

@@ -30,10 +30,10 @@ REPORT = ReportNumbers()
 
 
 class Report:
-    """What tells the observer of a plan about its progress; without an observer it does nothing.
+    """Calls the observer of a plan, the user's function, as the plan makes progress.
 
-    Each stage is reported once with the results of all batches, and the end of each batch is
-    reported.
+    Without an observer it does nothing. Each stage is reported once with the results of all
+    batches, and the end of each batch is reported.
     """
 
     def __init__(self, objects: Objects, batches: int, planned: int) -> None:

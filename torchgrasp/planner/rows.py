@@ -71,8 +71,8 @@ class ChoiceNumbers:
     refines.
     """
     lever: float = 0.3
-    """Weight of the load's lever arm in the cost relative to the fingertips' errors, both as
-    logarithms.
+    """Weight in the cost of the logarithm of the load's lever arm. The logarithm of the fingertips'
+    squared errors has the weight 1.
     """
     short: float = 0.1
     """Lever arm (no unit, of `lever_arm`) that is added to all: below it, differences hardly count.
@@ -194,7 +194,7 @@ class Candidates:
 
 
 def join_candidates(parts: Sequence[Candidates]) -> Candidates:
-    """Return several groups of contact sets as one group, in order.
+    """Return several groups of contact sets, with their states, as one group, in order.
 
     Only the first group may hold `grasps`, which the result keeps.
     """
@@ -214,12 +214,11 @@ def join_candidates(parts: Sequence[Candidates]) -> Candidates:
 
 
 def draw(objects: Objects, sizes: Sequence[int]) -> Iterator[tuple[ContactPlan, CloudIndex]]:
-    """Yield for each batch the contact plan of its initial guesses, and the index of each contact
-    set's object.
+    """Plan contacts; yield for each batch the contact sets, and the index of each set's object.
 
-    `sizes` are the numbers of initial guesses in the batches, for each object. A CPU plans batch by
-    batch. An accelerator plans all batches before the first, because each launch costs it more than
-    further contact sets.
+    A contact set is planned from each initial guess. `sizes` are the numbers of initial guesses in
+    the batches, for each object. A CPU plans batch by batch. An accelerator plans all batches
+    before the first, because each launch costs it more than further contact sets.
     """
     starts = torch.stack(objects.starts)  # (c, s, f, 3)
     clouds = len(objects)

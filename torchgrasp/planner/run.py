@@ -26,7 +26,10 @@ LIKELY = 0.5
 
 
 def plan_request(request: Request) -> Grasps:
-    """Return the grasps of a request: the executable ones, best first, and then the failed ones."""
+    """Return the grasps of a request: the executable ones, best first, and then the failed ones.
+
+    They are in the caller's frame, that of the request's cloud.
+    """
     return finish(request, list(_plan_batches(request)))
 
 
@@ -42,8 +45,10 @@ def plan_shaped(object_: ShapedObject, request: Request) -> Grasps:
 
 
 def stream_request(request: Request) -> Iterator[Grasps]:
-    """Yield the executable grasps of each batch that has any, the best first, as soon as the batch
-    ends.
+    """Yield the executable grasps of each batch, best first, as soon as the batch ends.
+
+    A batch is planned from some of the initial guesses; one without executable grasps is left out.
+    All are in the caller's frame, that of the request's cloud.
     """
     batches = list[Grasps]()
     for grasps in _plan_batches(request):
@@ -55,7 +60,10 @@ def stream_request(request: Request) -> Iterator[Grasps]:
 
 
 def finish(request: Request, batches: list[Grasps]) -> Grasps:
-    """Return the grasps of all batches, ranked together, and report them to the observer."""
+    """Return the grasps of all batches, ranked together, the executable ones first.
+
+    They are reported to the request's observer, as the stage "refine".
+    """
     grasps = rank_together(batches, request.order)
     counts = describe(count_status(grasps.status))
     request.tell("refine", f"{len(grasps)} refined: {counts}", grasps)
@@ -65,8 +73,9 @@ def finish(request: Request, batches: list[Grasps]) -> Grasps:
 def plan_hand(objects: Objects, deadline: float) -> Iterator[Grasps]:
     """Yield the grasps of the one object in `objects`, batch by batch of initial guesses.
 
-    If no grasp has a predicted success above 0.5 (`LIKELY`), further batches are planned with
-    relaxed constraints (`relax`). No batch begins after `deadline` [s], a time of `time.monotonic`.
+    They are in the object's upright frame. If no grasp has a predicted success above 0.5
+    (`LIKELY`), further batches are planned with relaxed constraints (`relax`). No batch begins
+    after `deadline` [s], a time of `time.monotonic`.
     """
     yield from relax(objects, plan_object(objects, deadline), deadline)
 
@@ -75,13 +84,15 @@ def relax(objects: Objects, batches: Iterator[Grasps], deadline: float) -> Itera
     """Yield batches of grasps of a single object; if no grasp is likely to hold, plan also with
     relaxed constraints.
 
-    Likely is a predicted success above 0.5 (`LIKELY`). Contacts must be flat within the largest of
-    four radii that the object allows (`FLAT_RADII`), which can leave few contacts. With relaxed
-    constraints (`ContactSpec.relaxed`) the hand may begin above its pose, too, and go down while it
-    closes (`opened_pose`). Failed batches at the end of a search are yielded only for the last
+    The grasps are in the object's upright frame. Likely is a predicted success above 0.5
+    (`LIKELY`). The surface at a contact must be flat within a radius, the largest of four that the
+    object allows (`FLAT_RADII`). This can leave few contacts. With relaxed constraints
+    (`ContactSpec.relaxed`) the hand may begin above its pose, too, and go down while it closes
+    (`opened_pose`). Failed batches at the end of a search are yielded only for the last
     constraints. For earlier constraints, no batch after the last one with an executable grasp is
     yielded. `batches` are those of the first constraints. After `deadline` [s], a time of
-    `time.monotonic`, constraints are no longer relaxed.
+    `time.monotonic`, constraints are no longer relaxed. Nor are they for an object that cannot be
+    lifted out of its surroundings (`Objects.buried`).
     """
     failed = list[Grasps]()
     best = 0.0

@@ -45,11 +45,11 @@ def batch_sizes(mode: Mode, starts: int, crowded: bool) -> list[BatchSize]:
 
 
 def schedule(starts: int, most: int) -> list[BatchSize]:
-    """Return the sizes of batches with `starts` initial guesses, and `most` contact sets for the
-    hand, in all.
+    """Return the sizes of batches with `starts` initial guesses in all.
 
-    Each batch is six times (`SCHEDULE.growth`) as large as the one before. A small remainder joins
-    the last batch.
+    In all of them the hand tries `most` contact sets, or `starts` if that is less. Each batch is
+    six times (`SCHEDULE.growth`) as large as the one before. A small remainder joins the last
+    batch.
     """
     batches = list[BatchSize]()
     size = SCHEDULE.first

@@ -28,7 +28,10 @@ from torchgrasp.scene.table_image import TableImage
 
 @dataclasses.dataclass(frozen=True)
 class MergeNumbers:
-    """Bounds by which pieces of a segmented image are merged to objects."""
+    """Bounds by which pieces of a segmented image are merged to objects.
+
+    A piece is a connected smooth surface in the image. A body is a group of pieces of one object.
+    """
 
     gap: float = 0.008
     """Distance [m] between points of two pieces below which the pieces touch."""
