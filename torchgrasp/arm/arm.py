@@ -206,8 +206,8 @@ def features(tip: TipPoses) -> Float[Tensor, "k 12"]:
 
     The poses `tip` (3, 4, k) are in metres. The numbers are the position, then the entries of the
     rotation matrix times 71 mm. Their Euclidean distance is a distance of two poses. For small
-    rotations it is sqrt(t^2 + (100 r)^2), with the translation t [mm] and the angle r [rad] between
-    the poses.
+    rotations it is sqrt(t^2 + (100 r)^2). Here t [mm] is the translation and r [rad] the angle
+    between the poses.
     """
     turn = LEVER / math.sqrt(2) * tip[:, :3].flatten(0, 1)
     return torch.cat([tip[:, 3] / MILLIMETRE, turn]).T

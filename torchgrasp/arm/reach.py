@@ -86,14 +86,15 @@ def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor,
 def with_arm(
     arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"]
 ) -> Grasps:
-    """Return grasps with the fields `arm` and `ease`, and the status `UNREACHABLE` where the arm
-    has no way.
+    """Return grasps with the arm's posture at each, and the status `UNREACHABLE` where the arm
+    cannot follow.
 
-    `arm` holds the joints [rad or m] of the arm at the grasp. `ease` holds two least numbers on the
-    way (`measure_ease`). First is the distance of a joint from its nearer limit, as a share of half
-    its range. Second is the manipulability [m^3]. Both fields are 0 without a way
-    (`follow_grasps`), and for grasps that were not executable. `world` holds what the arm must not
-    touch. Without a table there, the grasp is lifted along the unit vector `up`.
+    The arm must follow the hand on its way: the straight approach, the grasp and the lift. The
+    field `arm` holds the joints [rad or m] of the arm at the grasp. The field `ease` holds two
+    least numbers on the way (`measure_ease`). First is the distance of a joint from its nearer
+    limit, as a share of half its range. Second is the manipulability [m^3]. Both fields are 0 where
+    the arm cannot follow, and for grasps that were not executable. `world` holds what the arm must
+    not touch. Without a table there, the grasp is lifted along the unit vector `up`.
     """
     rows = flatnonzero(grasps.status == Status.OK)
     way, found, least = follow_grasps(arm, hand, grasps[rows], world, up)
@@ -117,9 +118,9 @@ def follow_grasps(
 
     On a way the arm stays within its joint limits and does not jump. Its links collide neither with
     the `world`, nor with each other or the palm. Several postures may reach the grasp. The way goes
-    through the easiest one from which the arm can follow all of it. The product of these two
-    numbers at the grasp is then the greatest. If the `world` has no table, the hand is lifted along
-    the unit vector `up`.
+    through the easiest one from which the arm can follow all of it. Easiest is that with the
+    greatest product of these two numbers at the grasp. If the `world` has no table, the hand is
+    lifted along the unit vector `up`.
     """
     poses = way_of(hand, grasps, world, up).to(arm.lower)
     starts = REACH.starts

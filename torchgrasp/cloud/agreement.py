@@ -145,8 +145,8 @@ def check_contacts(
 
 
 def check_seen(grasps: Grasps, cloud: PointCloud, name: str) -> None:
-    """Raise `BadArgument` if many contacts of grasps lie off the view of their object and the space
-    hidden behind it.
+    """Raise `BadArgument` if many contacts of grasps are far from their object's cloud, and from
+    the space hidden behind it.
 
     At most half of the contacts (`AGREEMENT.unseen_share`) may be more than 30 mm
     (`AGREEMENT.unseen`) from both. The cloud is in the frame of the grasps. Errors call the

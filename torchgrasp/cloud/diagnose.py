@@ -62,7 +62,7 @@ class DiagnosisNumbers:
     outliers: float = 0.05
     """Greatest share of outliers without advice."""
     sparse: float = 0.1
-    """Greatest spacing of the points, over the length of the cloud, without advice."""
+    """Greatest spacing of the points, as a share of the cloud's length, without advice."""
     noise: float = 0.003
     """Greatest noise [m] without advice."""
     flipped: float = 0.03

@@ -48,8 +48,8 @@ class PixelNumbers:
     steps: int = 12
     """Number of refinements; each tries a grid of 27 cameras about each of the best."""
     narrow: float = 0.5
-    """Width of a grid of cameras, over that of the first, below which only the best start is
-    refined.
+    """Ratio of the width of a grid of cameras to that of the first, below which only the best start
+    is refined.
     """
     narrowing: float = 0.65
     """Ratio of the width of a grid to that of the grid before."""

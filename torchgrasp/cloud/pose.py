@@ -187,7 +187,7 @@ class LayerNumbers:
     share: float = 0.2
     """Least share of all points that lie in the layer."""
     own: float = 0.25
-    """Greatest share of all points that lie on the given table, over the share in the layer."""
+    """Greatest ratio of the number of points on the given table to that in the layer."""
     standing: float = 0.01
     """Least share of all points that are higher than a layer above the table. Over the flat top of
     an object there are none.
@@ -330,8 +330,8 @@ def find_plausible(
     is the direction (3,) against gravity in this frame. With None, planes may face any way; but if
     a plane is level, walls are left out, unless the frame is the camera's. `known_unit` is whether
     the user gave the unit of the depth. `target` holds points of the object to grasp: planes under
-    it come first. Raises `BadArgument` for a pose
-    or a unit that the view contradicts, and `NoSupport` if there is no plane.
+    it come first. Raises `BadArgument` for a pose or a unit that the view contradicts, and
+    `NoSupport` if there is no plane.
     """
     eye = pose[:3, 3]
     image_up = -pose[:3, 1] if up is None and _is_own(pose) else None
@@ -539,7 +539,7 @@ def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -
 
     Returns one note, a sentence, if the camera is over 1 m high (`SIZES.high`), else none. A camera
     near to tiny objects gives one, too. `labels` (n,) holds the object of each of the `points` (n,
-    3) [m], 0 for none; `plane` is the table. The `pose` leads to their frame.
+    3) [m], 0 for none; `plane` is the table. The camera's `pose` (4, 4) [m] leads to their frame.
     """
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
     large_enough = [part for part in parts if len(part) >= SIZES.points]

@@ -63,8 +63,8 @@ class NormalNumbers:
     degrees.
     """
     over: float = 0.3
-    """Height of a neighbour over the tangent plane, over its distance, above which signs are not
-    compared. Such a neighbour is behind a thin wall.
+    """Ratio of a neighbour's height over the tangent plane to its distance, above which signs are
+    not compared. Such a neighbour is behind a thin wall.
     """
     pairs: int = 20
     """Least number of compared pairs of neighbours: of fewer any share may be chance."""
@@ -361,8 +361,8 @@ def point_inward(points: Points, normals: Points) -> bool:
 
     Then the surface is inside out, or hollow. They do if the sum of (p - c) . n, divided by that of
     |p - c|, is below -0.05 (`NORMALS.inward`). Here p are the points, c is their mean, and n are
-    the normals as unit vectors. By the divergence theorem, outward normals
-    of a closed surface give a positive sum. So do those of a view of a surface that bulges.
+    the normals as unit vectors. By the divergence theorem, outward normals of a closed surface give
+    a positive sum. So do those of a view of a surface that bulges.
     """
     away = points - points.mean(0)
     outward = float((away * unit_of_any(normals)).sum())

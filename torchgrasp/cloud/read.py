@@ -77,7 +77,7 @@ class ReadNumbers:
     copies of points.
     """
     more: float = 5.0
-    """Least number of rows with such a point, over the usual number of equal rows."""
+    """Least number of rows with such a point, as a multiple of the usual number of equal rows."""
 
 
 READ = ReadNumbers()

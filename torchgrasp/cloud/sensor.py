@@ -253,9 +253,10 @@ SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType(
 
 
 def find_sensor(noise: bool | SensorName | SensorNoise) -> SensorNoise | None:
-    """Return the model of a camera's noise, by name; None for no noise.
+    """Return the model of a camera's noise, by the camera's name; None for no noise.
 
-    True means the noise of an active stereo camera, False no noise; a model is returned itself.
+    Names are "realsense", "realsense_cloud", "kinect_v1", "azure" and "zivid". True means the noise
+    of an active stereo camera, False no noise; a model is returned itself.
     """
     if isinstance(noise, bool):
         return ACTIVE_STEREO if noise else None

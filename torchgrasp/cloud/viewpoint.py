@@ -105,7 +105,7 @@ def guess_viewpoint(
 
     First the origin is tried. It is returned if the points lie before it along z, and a camera
     there can have seen them. If `up` is known, the points must also lie below the origin. Else the
-    direction is searched: of all directions above the support, the one that best explains the bulge
+    direction is searched, among all directions above the support. The best one explains the bulge
     of the surface and the density of the points. The camera is placed along it, 4 radii of the
     cloud away.
 

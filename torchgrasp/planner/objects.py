@@ -259,9 +259,10 @@ class Objects:
 
     @property
     def reachable(self) -> Reachable | None:
-        """The function that says which hand poses arm and user accept, or None if all are accepted.
+        """The function that says which hand poses the arm reaches and the user's function accepts.
 
-        It takes poses (k, 4, 4) [m] in the upright frame, and returns booleans (k,).
+        It is None without an arm and such a function: all poses are then accepted. It takes poses
+        (k, 4, 4) [m] in the upright frame, and returns booleans (k,).
         """
         arm = self.request.arm
         frame = self.each[0].obj_from_upright
@@ -320,7 +321,7 @@ class Objects:
         """Return the grasps, with the arm's posture at each grasp if there is an arm.
 
         The arm must follow approach and lift within its limits and without a collision. Executable
-        grasps for which it cannot get the status `UNREACHABLE`.
+        grasps get the status `UNREACHABLE` if it cannot.
         """
         arm = self.request.arm
         if arm is None:

@@ -77,7 +77,7 @@ def predict(
     cover it.
 
     The second is the share, in [0, 1], of the conditions for which similar grasps were tried. The
-    conditions are the distributions of friction and mass; the success is the mean over them. Its
+    conditions are the distributions of friction and mass; the success is the mean over them. The
     log-odds fall by 2.1 (`UNCARRIED`) where the fingers cannot carry the mean weight with the mean
     friction. With obstacles, success also needs that the hand hits none. `cloud` (g,) is the index
     of each grasp's object.
@@ -111,7 +111,7 @@ def predict(
 
 
 def prove_resistance(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> Grasps:
-    """Return the grasps, with the proof of the loads that they resist in their certificates.
+    """Return the grasps; their certificates now prove which loads they resist.
 
     The proof is in the fields `task_margin` to `task_strength` of `Certificate`. The `task_margin`
     is the greatest multiple of the loads that a grasp resists. Executable grasps with a margin

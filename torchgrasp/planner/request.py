@@ -134,7 +134,7 @@ class Request:
     def contact_spec(self) -> ContactSpec:
         """The constraints on contacts, with the regions of `keep` and `avoid`.
 
-        Without a given spec they are those of the planning mode.
+        Without a given `spec` they are `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         """
         spec = self.spec or (ContactSpec.paper() if self.mode == "paper" else ContactSpec())
         if self.keep is None and self.avoid is None:
@@ -143,8 +143,9 @@ class Request:
 
     @property
     def order(self) -> Ranking:
-        """The criterion that ranks the grasps: the given one, or else the default of the planning
-        mode.
+        """The criterion that ranks the grasps: greatest predicted "success" or least "variance".
+
+        Without a given `ranking` it is "success", in mode "paper" "variance".
         """
         return self.ranking or ("variance" if self.mode == "paper" else "success")
 

@@ -254,11 +254,11 @@ def find_candidates(
 ) -> Candidates:
     """Return the chosen contact sets that have force closure, with their initial hand postures.
 
-    Of the successful sets of each object, at most `most` are chosen, which lie far apart. In mode
-    "paper" with ranking "variance" all are chosen, the most certain first. Chosen sets without
-    force closure are left out. A set whose greatest finger forces do not resist the loads is not
-    chosen. In the plan it gets the status `NOT_RESISTED`. The costs are 0 until `with_costs` sets
-    them.
+    Of the sets of each object that satisfy all constraints, at most `most` are chosen, which lie
+    far apart. In mode "paper" with ranking "variance" all are chosen, the most certain first.
+    Chosen sets without force closure are left out. A set whose greatest finger forces do not resist
+    the loads is not chosen. In the plan it gets the status `NOT_RESISTED`. The costs are 0 until
+    `with_costs` sets them.
 
     Args:
         objects: the objects of the plan.
@@ -323,9 +323,11 @@ def _spread(plan: ContactPlan, cloud: CloudIndex, most: int, clouds: int) -> Int
 
 @checked
 def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
-    """Return the indices, ascending, of at most `most` successful contact sets of a plan.
+    """Return the indices, ascending, of at most `most` contact sets of a plan that satisfy all
+    constraints.
 
-    Farthest-point sampling of the contacts' coordinates chooses sets that differ much.
+    Their status is `OK`. Farthest-point sampling of the contacts' coordinates chooses sets that
+    differ much.
     """
     rows = flatnonzero(plan.status == Status.OK)
     if len(rows) <= most:
@@ -354,13 +356,14 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     """Return `found` with the cost of each contact set (no unit; less is better).
 
     The cost is log(max(e, 0.001)) + 0.3 log(a + 0.1), with the numbers of `CHOICE`. Here a is the
-    lever arm of the set's load, without unit (`lever_arm`). The number e [mm2] is the least cost of
-    its first two initial postures (`seed_costs`), and infinite without any.
+    lever arm of the set's load, without unit (`lever_arm`). The number e [mm2] is the lesser sum of
+    squared errors of the first two initial postures. It is infinite without any. The errors are
+    those of fingertip positions, pad directions and clearances (`seed_costs`).
 
-    The initial postures of each set are sorted first (`_sort_seeds`). With loads to resist, or a
-    weight to lift, a set whose postures all carry less than the load costs 1e6 to 2e6 more
-    (`CHOICE.weak`). A weight is carried with the whole mean friction. Without this, two fingers at
-    a thin wall and one on the floor of a pan would do.
+    The initial postures of each set are first sorted: those that carry the most of the load come
+    first. There may be loads to resist, or a weight to lift. Then a set whose postures all carry
+    less costs 1e6 to 2e6 more (`CHOICE.weak`). A weight is carried with the whole mean friction.
+    Without this surcharge, two fingers at a pan's thin wall and one on its floor would do.
     """
     contacts = found.contacts
     seeds = found.seeds

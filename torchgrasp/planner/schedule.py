@@ -37,8 +37,8 @@ class BatchSize(NamedTuple):
 def batch_sizes(mode: Mode, starts: int, crowded: bool) -> list[BatchSize]:
     """Return the sizes of the batches of a plan with `starts` initial guesses.
 
-    A `mode` other than "joint" has one batch. `crowded` says whether the object is in a scene. The
-    hand tries at most 250 contact sets there, 160 in a scene (`SCHEDULE`).
+    A `mode` other than "joint" has one batch. `crowded` says whether the object is in a scene. In
+    all batches the hand tries at most 250 contact sets, in a scene at most 160 (`SCHEDULE`).
     """
     most = SCHEDULE.tried_in_scene if crowded else SCHEDULE.tried
     return schedule(starts, most) if mode == "joint" else [BatchSize(starts, most)]

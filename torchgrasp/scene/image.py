@@ -222,10 +222,10 @@ def image_of_cloud(
     """Return the depth image of a cloud, seen from its viewpoint, and the pixel (n, 2) of each
     point.
 
-    A pixel is row and column. The camera is a pinhole, upright, and looks at the middle of
-    the points. A pixel covers about two points and keeps the nearest. `points` (n, 3) and
-    `viewpoint` (3,) are in metres; `up` (3,) is the unit vector that points up. All are in one
-    frame. Raises `BadArgument` for points all around the camera.
+    A pixel is row and column. The camera is a pinhole, upright, and looks at the middle of the
+    points. A pixel covers about two points and keeps the nearest. `points` (n, 3) and `viewpoint`
+    (3,) are in metres; `up` (3,) is the unit vector that points up. All are in one frame. Raises
+    `BadArgument` for points all around the camera.
     """
     forward = unit(unit(points - viewpoint).mean(0))
     down = -up + (up @ forward) * forward

@@ -99,7 +99,7 @@ class TableImage(Value):
 
     @kept
     def flat(self) -> Bool[Tensor, "h w"]:
-        """Mask of the pixels on the table, which measure its noise.
+        """Mask of the pixels on the table, by which the noise of its heights is estimated.
 
         Their mean heights are within 10 mm (`HEIGHT.band`) of the table.
         """
