@@ -127,8 +127,8 @@ def merge_pieces(view: TableImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "k
     """Merge the pieces of a depth image to objects; return the number of each piece's object.
 
     A piece is a connected smooth surface of the image. Entry i of the result is for the piece with
-    the number i in `pieces` (h, w). Objects count from 1. A piece of number 0 is no piece, and its
-    entry is 0.
+    the number i in `pieces` (h, w). Objects count from 1. Number 0 is no piece, and its entry is 0.
+    A small piece far from all objects gets 0, too.
     """
     new = torch.zeros(int(pieces.max()) + 1, dtype=torch.long)
     whole = torch.bincount(pieces.reshape(-1))

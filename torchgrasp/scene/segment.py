@@ -155,11 +155,11 @@ def _risen(view: TableImage) -> Bool[Tensor, "h w"]:
 
 
 def at_one_jump(view: TableImage) -> Bool[Tensor, "h w"]:
-    """Return a mask of the pixels above the table that may lie on thin bars, beside a jump of
-    depth.
+    """Return a mask of the pixels above the table beside which the depth does not jump both back
+    and forward.
 
-    The depth jumps back or forward beside them, but not both. `rests_on` misses such pixels. Flying
-    pixels, between a nearer and a farther surface, are left out.
+    Pixels of a thin bar are beside one jump, and `rests_on` misses them. Flying pixels are left
+    out: they lie between a nearer and a farther surface, so beside two jumps.
     """
     before_jump, behind_jump = _jumps(view.smooth)
     return _risen(view) & ~(before_jump & behind_jump)
