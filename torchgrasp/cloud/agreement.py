@@ -159,8 +159,8 @@ def check_seen(grasps: Grasps, cloud: PointCloud, name: str) -> None:
 
 
 def check_where(name: str, distance: Callable[[Points], Tensor], cloud: PointCloud) -> None:
-    """Raise `BadArgument` if the region in which contacts must lie is far from a cloud, and from
-    the space behind it.
+    """Raise `BadArgument` if the region in which contacts must lie is far from a cloud and the
+    space behind it.
 
     The space behind it is what the cloud's points hide from their camera.
 

@@ -37,8 +37,8 @@ class RenderNumbers:
     """Parameters of the rendering of a mesh and a table by a virtual camera."""
 
     nearest: float = 1e-3
-    """Depth [m] of a mesh's nearest vertex, above which rays are cast only in the mesh's bounding
-    box in the image. For a nearer mesh they are cast through all pixels.
+    """Depth [m] of a mesh's nearest vertex, above which rays are cast only in its bounding box in
+    the image. For a nearer mesh they are cast through all pixels.
     """
     margin: float = 1e-2
     """Width [focal lengths] of a margin around this bounding box, against rounding."""

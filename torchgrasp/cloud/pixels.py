@@ -48,7 +48,7 @@ class PixelNumbers:
     steps: int = 12
     """Number of refinements; each tries a grid of 27 cameras about each of the best."""
     narrow: float = 0.5
-    """Ratio of the width of a grid of cameras to that of the first, below which only the best start
+    """Width of a grid of cameras, as a share of that of the first, below which only the best start
     is refined.
     """
     narrowing: float = 0.65
