@@ -170,6 +170,9 @@ def test_a_table_with_an_edge_moves_as_a_whole_and_its_text_is_read_back(seed):
             read_plane(Plane.horizontal(0.1).describe() + wrong)
     with pytest.raises(BadArgument, match="table"):
         read_plane(table.describe() + "; edge normal 1 0 0, offset 0")
+    for other in ("up 0 0 1, at 0.1", "normal 0 0 1, offset 0.1 m", "normal 0 0, offset 0.1", ""):
+        with pytest.raises(BadArgument, match="normal X Y Z, offset D"):
+            read_plane(other)
 
 
 def test_an_edge_passes_through_its_point_and_is_vertical_on_the_table():

@@ -152,16 +152,19 @@ def read_plane(text: str) -> Plane:
     """Return the plane that a text describes, such as "normal 0 0 1, offset 0.1"
     (`Plane.describe`).
 
-    The offset is in metres, and the plane is in float64. Raises `BadArgument` if the text lacks
-    these numbers, or the normal is not of unit length.
+    The offset is in metres, and the plane is in float64. Raises `BadArgument` for any
+    other text, or a normal that is not of unit length.
     """
     own, *edges = text.split("; edge ")
-    words = own.replace(",", "").split()
     try:
-        x, y, z, offset = (float(words[k]) for k in (1, 2, 3, 5))
+        first, *normal, last, offset = own.replace(",", "").split()
+        x, y, z = map(float, normal)
+        offset = float(offset)
+        if (first, last) != ("normal", "offset"):
+            raise ValueError
         edge = [read_plane(part) for part in edges]
         (beyond,) = edge or [None]
-    except (ValueError, IndexError):
+    except ValueError:
         raise BadArgument("table", repr(text), "'normal X Y Z, offset D'") from None
     return Plane(torch.tensor([x, y, z], dtype=torch.float64), offset, beyond)
 

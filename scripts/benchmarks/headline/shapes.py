@@ -185,6 +185,9 @@ def measure_floor(seen: torch.Tensor, measured: torch.Tensor) -> float:
 def _hidden(what: str, found: list[dict[str, float]], bar: str) -> Row:
     """Return the row of the hidden side: medians over views, and mean shares within k std_m."""
     good = [x for x in found if x["median"] == x["median"]]
+    if not good:
+        words = f"not measured: {len(found)} refused"
+        return Row(f"hidden side, {what}", bar, words, False, {"views": found})
     middle = {key: statistics.median(x[key] for x in good) for key in ("median", "p90")}
     share = {k: statistics.mean(x[f"within_{k}"] for x in good) for k in (1, 2, 3)}
     words = f"median {middle['median']:.1f} mm, 90 % below {middle['p90']:.1f} mm; within 1, 2, 3 std_m "
