@@ -325,13 +325,20 @@ def find_plausible(
 ) -> tuple[SupportPlane, ...]:
     """Return the planes on which objects may stand, the most plausible first.
 
-    `points` (n, 3) [m] and the `table` are in the frame to which the camera's `pose` (4, 4) [m]
-    leads. The table is a plane or a height z [m]. With None, planes are sought in the points. `up`
-    is the direction (3,) against gravity in this frame. With None, planes may face any way; but if
-    a plane is level, walls are left out, unless the frame is the camera's. `known_unit` is whether
-    the user gave the unit of the depth. `target` holds points of the object to grasp: planes under
-    it come first. Raises `BadArgument` for a pose or a unit that the view contradicts, and
-    `NoSupport` if there is no plane.
+    Args:
+        points: the points (n, 3) [m] of the view; all arguments are in their frame.
+        pose: pose (4, 4) [m] of the camera in this frame.
+        table: the table as a plane, or its height z [m]; None to search for planes in the points.
+        up: direction (3,) against gravity. None allows planes that face any way. But if a plane is
+            level (its normal is near z), walls are left out. They are kept in the camera's own
+            frame, where z need not be up.
+        known_unit: whether the user gave the unit of the depth. Then the camera may be up to 10 m
+            above the table that is found, else up to 4 m (`POSE.highest`, `POSE.high`).
+        target: the object to grasp; None if unknown. Planes under it come first.
+
+    Raises `BadArgument` if the view contradicts the pose, the unit or the given table. Examples
+    are a table upside down, a camera too high above it, or a given table far from all points.
+    Raises `NoSupport` if there is no plane.
     """
     eye = pose[:3, 3]
     image_up = -pose[:3, 1] if up is None and _is_own(pose) else None
@@ -387,7 +394,8 @@ def check_view(
     `points` (n, 3) [m] are in the frame to which the camera's `pose` (4, 4) [m] leads. `target`
     holds the points of the object for which the table is sought, in the same frame. `up` is the
     direction (3,) against gravity there; None means z. `known_unit` is whether the user gave the
-    unit of the depth.
+    unit of the depth. Then the camera may be up to 10 m above the table, else up to 4 m
+    (`POSE.highest`, `POSE.high`).
     """
     image_up = -pose[:3, 1] if up is None and _is_own(pose) else None
     try:

@@ -252,9 +252,11 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None,
     """Return closure margin, residual max |W phi|, witness (6,) and coefficients phi (m,) of one
     contact set, by HiGHS.
 
-    `wrench` (m, 6) holds the m edge wrenches, which are the columns of W. The margin is the least
-    coefficient, or -inf if no coefficients balance the wrenches. The witness is the unit wrench
-    that proves the margin, or None if HiGHS gives none.
+    `wrench` (m, 6) holds the m edge wrenches, which are the columns of W; nothing has a unit. Of
+    all phi with W phi = 0 and sum 1, HiGHS finds one whose least coefficient is greatest. The
+    margin is this coefficient. If no phi balances the wrenches, the margin is -inf, the residual
+    inf, and phi 0. The witness is a wrench of length 1, which proves that no margin is greater. It
+    is None if HiGHS gives none.
     """
     m = len(wrench)  # seven equations in the margin s and psi = phi - s >= 0
     equations = np.zeros((7, m + 1))

@@ -232,16 +232,25 @@ def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Tensions]:
 
 @dataclasses.dataclass(frozen=True)
 class Constraints(Batch):
-    """Values of all constraints, and their Jacobians with respect to the u unknowns: 3 f point
-    coordinates, then p tensions.
+    """Values of all constraints on b contact sets, and their Jacobians with respect to the u
+    unknowns of a set.
 
-    `centre` (normalised) is the centroid of the f contacts, and `surface` (normalised) their signed
-    distances from the surface. Both should be 0. The k numbers in `bounds` should be <= 0. First
-    come f friction cones, as differences of cosines. Then come f variances: the excess over the
-    limit, divided by the slope of the variance there. All further ones are normalised lengths: f
-    domain limits, p distances between fingertips. With a table f heights follow, and with a region
-    f distances from it. `centre_by_x`, `surface_by_x` and `bounds_by_x` are the Jacobians of the
-    three.
+    The unknowns are the 3 f coordinates of the f contacts, then p tensions, one for each pair of
+    contacts. With the force tension times distance, the two contacts of a pair pull each other.
+    `centre` (normalised) is the centroid of the contacts, and `surface` (normalised) their signed
+    distances from the surface. Both should be 0. The k numbers in `bounds` should be <= 0. They
+    are, in this order:
+
+    * f friction cones: by how much each force is outside its cone, as a difference of cosines;
+    * f variances: the excess over the limit, divided by twice the standard deviation at the limit;
+    * f limits of the domain, the ball in which the shape is known: how far a contact is outside;
+    * p distances: by how much the fingertips of a pair are too close;
+    * with a table, f depths of the fingertips below it;
+    * with a region, f signed distances of the contacts from it, positive outside.
+
+    All but the cones are normalised lengths. Small margins make them a little stricter than the
+    constraints of the user. `centre_by_x`, `surface_by_x` and `bounds_by_x` are the Jacobians of
+    the three.
     """
 
     centre: Float[Tensor, "b 3"]

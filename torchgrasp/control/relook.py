@@ -18,7 +18,11 @@ REACH = 0.08  # largest displacement [m] on each axis of the table that `relocat
 
 @dataclasses.dataclass(frozen=True)
 class RelookNumbers:
-    """Parameters of `relocate`, the search for the object's motion from a new view."""
+    """Parameters of `relocate`, the search for the object's motion from a new view.
+
+    A motion is a shift (x, y) [m] along the table and a rotation [rad] about its normal. The search
+    tries a grid of motions, and improves the best ones by Gauss-Newton steps.
+    """
 
     scale: float = 0.004
     """Scale s [m] of Cauchy's cost: points farther than this from the surface count less."""

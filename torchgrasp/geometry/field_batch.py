@@ -24,7 +24,10 @@ class FieldBatch(DistanceField):
     entry.
 
     The batch has r entries. Points given to a method have the shape (r, ..., 3). The points of
-    entry i belong to the field with the index `owner[i]`. They are in the frame of its object.
+    entry i belong to the field with the index `owner[i]`. They are in the frame of its object. Each
+    field is a grid of nodes, between which it is interpolated. `nodes` holds the n distances [m] of
+    all grids, `places` their origins and spacings [m], and `steps` the layout of each in `nodes`.
+    Make a batch with `of`.
     """
 
     # signed distances [m] at all nodes of all c fields, one field after another

@@ -210,9 +210,11 @@ def bound(
         on: mask of the points that lie on the plane.
         eye: position (3,) [m] of the camera; None if unknown.
 
-    The region is the convex hull of the largest connected group of the points on the plane. Another
-    large group joins it if the camera sees almost nothing below the plane between the groups. Then
-    an object hides that area. Returns None if the points on the plane span no area.
+    The region is the convex hull of the largest connected group of the points on the plane. An
+    object on the plane may hide the area between two groups. So another large group joins if the
+    camera sees almost nothing below the plane through that area. If `eye` is None, points up to 0.3
+    m straight below the area are counted instead. Returns None if the points on the plane span no
+    area.
     """
     if int(on.sum()) < 3:
         return None

@@ -65,14 +65,17 @@ def find_table(
     Args:
         points: the points (n, 3) [m] of the view; all arguments are in their frame.
         viewpoint: position (3,) [m] of the camera.
-        table: the table as a plane, or its height [m] along z; None to search for supports.
+        table: the table as a plane without an `edge`, or its height [m] along z; None to search for
+            supports.
         up: upward direction, three numbers of any length; None if unknown.
         target: the object to grasp; None if unknown. Supports on which it stands come first.
         image_up: direction (3,) that points up in the camera's image; None if unknown.
 
     A support has the region that the points on it cover. The region of a given table is unbounded
-    if they cover none. Raises `BadArgument` for a camera below the table, or a table with an edge.
-    Raises it also for `up` more than 60 degrees from the table's normal. Raises `NoSupport` if no
+    if they cover none.
+
+    Raises `BadArgument` for a camera below the given table, or a `Plane` that has an `edge`. Raises
+    it also for `up` more than 60 degrees from the given table's normal. Raises `NoSupport` if no
     support is found.
     """
     plane = as_plane(table)

@@ -213,11 +213,13 @@ def solve_with_sliding(
 
 
 def solve_all(objects: Objects, rows: Candidates) -> Grasps:
-    """Return the grasps of all contact sets `rows`, executable ones first, in a mode other than
-    "joint".
+    """Return the grasps of all contact sets `rows` in the modes "paper" and "contact_first",
+    executable ones first.
 
-    The mode "paper" solves as the paper's method does. The mode "contact_first" refines postures of
-    the learned model onto fixed contacts.
+    `objects.request.mode` is the mode that the user chose. In "paper", the paper's solver (COBYLA)
+    moves the hand onto the contacts. In "contact_first", postures of the learned model are refined
+    onto fixed contacts. `objects` holds the shapes of all objects, the hand and the constraints.
+    The grasps are in the upright frame.
     """
     reach = objects.reach(rows.contacts, rows.certificate, rows.cloud)
     solve = solve_as_paper if objects.request.mode == "paper" else solve_contact_first

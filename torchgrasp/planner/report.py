@@ -1,5 +1,5 @@
 """Reports of the planner to an observer. It hears of each stage once, with the results of all
-batches, and of the end of each batch.
+batches. It also hears of the end of each batch except the last one of the plan.
 """
 
 import dataclasses
@@ -32,8 +32,10 @@ REPORT = ReportNumbers()
 class Report:
     """Calls the observer of a plan, the user's function, as the plan makes progress.
 
-    Without an observer it does nothing. Each stage is reported once with the results of all
-    batches, and the end of each batch is reported.
+    Without an observer it does nothing. The estimated shape is reported first. Then each batch of
+    initial guesses passes three stages: contacts, force closure and initial hand postures. A stage
+    is reported once, when the last of these batches has passed it, with the results of all. The end
+    of each batch is reported with its grasps, except that of the plan's last batch.
     """
 
     def __init__(self, objects: Objects, batches: int, planned: int) -> None:

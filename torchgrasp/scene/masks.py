@@ -182,10 +182,12 @@ def _dense(values: Tensor) -> Tensor:
 
 
 def read_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Tensor, "..."]:
-    """Return the boolean mask of one object, in the given shape.
+    """Return the boolean mask of one object, True on the object.
 
-    `mask` may be an image (h, w), or have any other form that `read_labels` takes. Raises
-    `BadArgument` if it marks no object, or several.
+    `shape` is that of the depth (h, w) or of the cloud (n,), and of the result. `mask` is an array
+    of this shape: one number > 0, such as 1 or 255, on the object, and 0 elsewhere. It may also be
+    a picture (h, w, 3 or 4) that is black elsewhere, or COCO's run lengths. Other forms are those
+    of `read_labels`. Raises `BadArgument` for anything else, or if it marks no object, or several.
     """
     labels = read_labels(mask, shape, "mask")
     found = labels[labels > 0].unique()

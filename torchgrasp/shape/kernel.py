@@ -244,9 +244,11 @@ def differentiate_thin_plate(
     r: Tensor,
     count: int,
 ) -> tuple[Tensor, ...]:
-    """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2, in closed form.
+    """Return the thin plate kernel k(r) and its derivatives with respect to r^2 / 2, in closed form.
 
-    The kernel is `thin_plate`; its length `psi` and the distances `r` are normalised.
+    They are the first `count` (1 to 4) of k, k1, k2, k3, as `Kernel.derivatives` defines them, each
+    in the shape of `r`. The kernel is 2 r^3 - 3 psi r^2 + psi^3 (`thin_plate`). Its length `psi`
+    and the distances `r`, of any shape, are normalised. At r = 0 infinite values count as 0.
     """
     # each pass over the distances counts: k is r^2 (k' / 3 - psi) + psi^3
     first = (r - psi).mul_(6)

@@ -95,13 +95,21 @@ def measure_grasps(
     """Return the k features that predict the success of g grasps in a task, for each of c
     conditions.
 
-    The features are in the order of the tuple `FEATURES`. The dict `CAUSES` gives their units;
-    shares and logarithms have none. Body and grasps are in an upright frame; `body` is one object
-    for all grasps, or one for each. `conditions` are c pairs of a friction coefficient and a mass
-    [kg]; they replace the mass of the `task`. `lifted` says whether the task is a lift; otherwise
-    the object is pulled. A force to spare is the logarithm of a ratio: the fingers' strength
-    divided by the force needed. "force needed", "force to spare" and the features named "slippery"
-    are at half the friction.
+    The k features are in the order of the tuple `FEATURES`, which names them. The dict `CAUSES`
+    gives their units, and its text their meaning.
+
+    Args:
+        hand: the hand of the grasps.
+        body: the estimated object, one for all grasps, or one for each, in an upright frame.
+        grasps: the g grasps, in the same frame.
+        conditions: c pairs of a friction coefficient and a mass [kg]. The mass of the `task` has
+            no effect.
+        task: how the hand presses and closes, and whether the object may be displaced.
+        lifted: whether the object is lifted; otherwise it is pulled.
+
+    Two features are named "force needed" and "force to spare". The second is the logarithm of a
+    ratio: the fingers' strength divided by the force needed. Both, and the features named
+    "slippery", are computed with half the friction coefficient.
     """
     contacts = grasps.contacts
     g = len(grasps)

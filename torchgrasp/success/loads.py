@@ -49,10 +49,11 @@ def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> 
     """Return the lever arm (no unit) of a load at `center` [m] on each set of f contact `points`
     [m].
 
-    It is the distance of `center` from the longest side of the contacts' triangle. It is divided by
-    the triangle's height over this side, plus 10 mm (`LOADS.torsion`). About this side the object
-    turns most easily. For more than three contacts, the triangle with the smallest result counts.
-    `center` is one point (3,), or one for each of the b sets (b, 3). All points are in one frame.
+    It is d / (h + 10 mm). Here d is the distance of `center` from the line of the longest side of
+    the contacts' triangle. About this side the object turns most easily, and h is the triangle's
+    height over it. The 10 mm (`LOADS.torsion`) stand for the torsional friction of a contact. For
+    more than three contacts, the triangle with the smallest result counts. `center` is one point
+    (3,), or one for each of the b sets (b, 3). All points are in one frame.
     """
     if points.shape[1] > 3:
         triples = subsets(points.shape[1], 3, points.device)

@@ -80,8 +80,9 @@ def nested(default: Any) -> Any:
 def arguments(**names: str) -> Callable[[type[T]], type[T]]:
     """Return a decorator that makes a class a frozen dataclass of command-line arguments.
 
-    `names` gives the field of the class for an argument of the library, as `points="cloud"`. An
-    error that names the argument is then shown with this field's option.
+    Each keyword of `names` is an argument of the library, and its value a field of the class. With
+    `points="cloud"`, an error about the library's argument `points` names the user's option of the
+    field `cloud`.
     """
 
     def make(cls: type[T]) -> type[T]:

@@ -70,7 +70,10 @@ class SceneInk:
 
 @dataclasses.dataclass(frozen=True)
 class SceneText:
-    """Layout of the numbers on objects and of the legend [pixels]."""
+    """Layout of the numbers on objects and of the legend below a scene's picture.
+
+    Sizes and positions are in pixels, except where a field says otherwise.
+    """
 
     font: int = 24  # size of the legend's text, and least size of a number on an object
     number: float = 1.1  # size of a number, in radii of the largest circle in its object
