@@ -90,8 +90,8 @@ class LinearConstraints(Linearisation):
     """The linearised constraints of the contact sets that still go on, a in number, at their
     present state.
 
-    Each set has r constraints on u unknowns: the coordinates of its contacts, then its tensions. A
-    satisfied inequality has the weight 0.
+    Each set has r constraints on u unknowns: the normalised coordinates of its contacts, then its
+    tensions. A satisfied inequality has the weight 0.
     """
 
     # values of the constraints, in the units of `Constraints`, times their weight
@@ -113,7 +113,7 @@ class Descent(Minimisation[State, LinearConstraints]):
     constraints of each contact set.
 
     In shapes, a counts the contact sets that still go on. u counts the unknowns of a set: the
-    coordinates of its contacts, then the tensions of the pairs.
+    normalised coordinates of its contacts, then the tensions of the pairs.
     """
 
     shape: ShapeLike  # the estimated surface, or one for each contact set
@@ -142,9 +142,9 @@ class Descent(Minimisation[State, LinearConstraints]):
         """Return the damped step (a, u) of each contact set, and a mask (a,) of the sets that go
         on.
 
-        A set goes on if its step is at least `Stage.settled` long. `model` holds the linearised
-        constraints, and `damping` (a,) a number for each set. A step changes the u unknowns, and is
-        NaN for a singular matrix.
+        A set goes on if one of its contacts moves by more than `Stage.settled`, normalised. `model`
+        holds the linearised constraints, and `damping` (a,) a number for each set. A step changes
+        the u unknowns, and is NaN for a singular matrix.
         """
         jacobian = model.weighted_jacobian
         scale = jacobian.new_ones(1, jacobian.shape[2])
@@ -161,7 +161,8 @@ class Descent(Minimisation[State, LinearConstraints]):
     def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
         """Return the state of the contact sets after the step `x` (a, u) of their unknowns.
 
-        The contacts move along the surface. `state` holds contacts and tensions before the step.
+        A step changes the normalised coordinates of contacts, then the tensions. The moved contacts
+        are brought back onto the surface. `state` holds contacts and tensions before the step.
         `rows` (a,) are the indices of these sets in the batch.
         """
         by_points, by_tension = split_unknowns(x)

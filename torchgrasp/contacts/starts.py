@@ -257,9 +257,10 @@ def good_sets(
     computed on demand.
 
     Good sets have force closure, and contacts far enough from each other, as `problem` demands.
-    `points` (p, 3) are the normalised candidates, `normals` (p, 3) their outward unit normals. In
-    each of 8 rounds (`ROUNDS`), `generator` draws 20 sets (`DRAWN_PER_START`) for each of `starts`
-    wanted sets.
+    `points` (p, 3) are the normalised candidates, `normals` (p, 3) their outward unit normals.
+    `starts` is the number of sets that the caller wants. In each of 8 rounds (`ROUNDS`),
+    `generator` draws 20 times as many (`DRAWN_PER_START`). All good ones among them are yielded,
+    which may be fewer or more than `starts`. A portion may be empty.
     """
     for _ in range(ROUNDS):
         drawn = draw_sets(len(points), DRAWN_PER_START * starts, problem.spec.fingertips, generator)

@@ -268,8 +268,8 @@ class ClosingReference(Value):
 
 @dataclasses.dataclass(frozen=True)
 class PlanNumbers:
-    """Bounds beyond which `check_plan` refuses a closing plan: its table or its surface is in
-    another frame or unit.
+    """Bounds [m or rad] beyond which `check_plan` refuses a closing plan: its table or its surface
+    seems to be in another frame or unit.
     """
 
     tilt: float = 0.5

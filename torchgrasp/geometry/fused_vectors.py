@@ -5,37 +5,37 @@ from torchgrasp.foundation.fused import inlined
 
 @inlined
 def dot(a, b):
-    """Return the dot product of the vectors `a` and `b`."""
+    """Return the dot product of the vectors `a` and `b` of 3 numbers."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inlined
 def cross(a, b):
-    """Return the cross product of the vectors `a` and `b`, as a tuple."""
+    """Return the cross product of the vectors `a` and `b` of 3 numbers, as a tuple."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @inlined
 def add(a, b, factor):
-    """Return the vector `a` plus `factor` times the vector `b`, as a tuple."""
+    """Return `a` + `factor` `b` as a tuple; `a` and `b` are vectors of 3 numbers."""
     return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
 
 
 @inlined
 def minus(a, b):
-    """Return the vector `a` minus the vector `b`, as a tuple."""
+    """Return `a` - `b` as a tuple; both are vectors of 3 numbers."""
     return add(a, b, -1.0)
 
 
 @inlined
 def scale(v, factor):
-    """Return the vector `v` times the number `factor`, as a tuple."""
+    """Return the vector `v` of 3 numbers times the number `factor`, as a tuple."""
     return v[0] * factor, v[1] * factor, v[2] * factor
 
 
 @inlined
 def put(row, v):
-    """Write the vector `v` into `row`, a row of an array."""
+    """Write the vector `v` of 3 numbers into the first 3 entries of the array `row`, in place."""
     for k in range(3):
         row[k] = v[k]
 

@@ -68,10 +68,19 @@ def refine_by_cobyla(
 
 
 class CobylaRun:
-    """One run of SciPy's COBYLA from initial `joints` [rad or m] onto three contact `points` [m].
+    """One run of SciPy's COBYLA, which moves the three fingertips of a hand onto three contact
+    points.
 
-    The points are in the object's frame; `world` holds what the hand must not touch. l counts the
-    hand's links. The values at the last evaluated point are cached.
+    The variables are the h actuated joints. The hand's pose follows from them: it aligns the
+    triangle of the fingertips with that of the contacts (Eq. 24 of the paper). The sum of the
+    distances between fingertips and contacts is minimised, while the hand keeps clear of itself and
+    the world. l counts the hand's links. The values at the last evaluated joints are cached.
+
+    Args:
+        hand: a hand with three grasping fingers.
+        joints: initial actuated joints (h,) [rad or m].
+        points: contact points (3, 3) [m] in the object's frame; point i is for finger i.
+        world: object, table and obstacles that the hand must not touch, in the object's frame.
     """
 
     def __init__(

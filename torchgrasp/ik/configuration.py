@@ -121,7 +121,10 @@ class SpatialJacobian(Value):
         self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]
     ) -> Float[Tensor, "g k d"]:
         """Return the derivatives of k residuals of each configuration by its d = 6 + h unknowns.
-        These are the hand's pose (6) and the h actuated joints.
+        These are the hand's translation [m], its rotation [rad], then the h actuated joints [rad or
+        m].
+
+        Translation is along the axes of the hand's root link, and rotation about them.
 
         `wrench` holds the residuals' derivatives by a translation [m] and a rotation [rad] about
         the object's origin. `moves` is 1 where a motion changes a residual, else 0.
@@ -136,9 +139,10 @@ def differentiate(spatial: SpatialJacobian, parts: Sequence[ResidualRows]) -> Re
     m, 6 + h).
 
     `parts` are the groups, in the order of the result. The m residuals are weighted. They are
-    lengths [mm], or errors of the cosines between pads and surface. The Jacobian is by the pose's
-    translation [m] and rotation [rad], then by the h actuated joints. `spatial` holds the
-    kinematics of the hands.
+    lengths [mm], or errors of the cosines between pads and surface. The Jacobian is by the hand's
+    translation [m] and rotation [rad], then by the h actuated joints [rad or m]. Translation is
+    along the axes of the hand's root link, and rotation about them. `spatial` holds the kinematics
+    of the hands.
     """
     residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))
     return residual, spatial.jacobian(wrench, moves)

@@ -46,7 +46,9 @@ class ImageNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class ProjectionNumbers:
-    """Parameters of the depth image that is made from a cloud by projection."""
+    """Parameters of the depth image that is made by projecting the points of a cloud onto an image
+    plane of its camera.
+    """
 
     steep: float = 0.01
     """Least length of the part of the vertical unit vector that lies in the image plane. A view

@@ -155,11 +155,12 @@ def _risen(view: TableImage) -> Bool[Tensor, "h w"]:
 
 
 def at_one_jump(view: TableImage) -> Bool[Tensor, "h w"]:
-    """Return a mask of the pixels above the table beside which the depth does not jump both back
-    and forward.
+    """Return a mask of the pixels above the table, without flying pixels: those beside at most one
+    jump of depth.
 
-    Pixels of a thin bar are beside one jump, and `rests_on` misses them. Flying pixels are left
-    out: they lie between a nearer and a farther surface, so beside two jumps.
+    A flying pixel lies between a nearer and a farther surface. So the depth jumps back beside it on
+    one side, and forward on another. The pixels of a thin bar are beside jumps back only. They are
+    in this mask, but not in that of `rests_on`.
     """
     before_jump, behind_jump = _jumps(view.smooth)
     return _risen(view) & ~(before_jump & behind_jump)

@@ -351,11 +351,12 @@ def combined_covariance(
     x: Float[Tensor, "b g p 3"],
     weights: Float[Tensor, "#b #g m p"],
 ) -> Float[Tensor, "b v v"]:
-    """Return the posterior covariance of weighted sums of signed distances, normalised.
+    """Return the posterior covariance (b, v, v) of v weighted sums of signed distances, for each of
+    b sets of points.
 
-    The sums are over points: `x` holds g groups of p normalised points in each of b entries.
-    `weights` are those of m sums over each group's points. The result (b, v, v) covers all v = g m
-    sums of an entry, in squared normalised units.
+    `x` are normalised points. Each set has g groups of p points. `weights` are those of m sums over
+    the points of each group, so v = g m. The sums of the first group come first. The result is in
+    squared normalised units; one unit is `scale` [m].
     """
     b, g, p, _ = x.shape
     rows = len(posterior.factor)

@@ -26,8 +26,8 @@ BOUNDS = 200  # bounds of the log-odds that are tried, at equal steps
 
 
 class Promise(NamedTuple):
-    """A bound of the predicted success, above which a promised share of the grasps holds, by the
-    evidence of trials.
+    """A bound of the predicted success, above which a promised share of the grasps holds the
+    object, by the evidence of trials.
     """
 
     least: float  # least predicted log-odds of success of a returned grasp
@@ -38,7 +38,7 @@ class Promise(NamedTuple):
 @functools.cache
 def find_promise(share: float) -> Promise | None:
     """Return the least bound of the predicted success above which at least a `share` of the grasps
-    holds.
+    holds the object.
 
     `share` is in [0, 1]. The trials of the shipped success model support it. None means that they
     support no bound.
@@ -49,9 +49,10 @@ def find_promise(share: float) -> Promise | None:
 
 
 def describe_promise(share: float) -> str:
-    """Return a text that names the promised `share`, in [0, 1], and the trials that support it.
+    """Return a text on the promise that at least a `share` of the returned grasps holds the object.
 
-    If no trials support it, the text says so.
+    The text names the `share`, in [0, 1], and the trials that support the promise. If no trials
+    support it, the text says so.
     """
     promise = find_promise(share)
     if promise is None:
@@ -65,12 +66,13 @@ def describe_promise(share: float) -> str:
 def least_log_odds(
     log_odds: Float[Tensor, "r"], held: Bool[Tensor, "r"], family: Int[Tensor, "r"], share: float
 ) -> float | None:
-    """Return the least bound of the log-odds above which at least a `share` of the grasps holds.
+    """Return the least bound of the log-odds of success above which at least a `share` of the
+    grasps holds the object.
 
-    These are log-odds of success. None means that the trials support no bound. `share` is in [0,
-    1]. The bound is chosen by conformal risk control over families of bodies. It is the least b
-    with sum_f l_f + `share` <= 0. Here l_f is the mean of 1[log-odds >= b] (1[failed] - (1 -
-    `share`)) over the trials of family f.
+    None means that the trials support no bound. `share` is in [0, 1]. The bound is chosen by
+    conformal risk control over families of bodies. It is the least b with sum_f l_f + `share` <= 0.
+    Here l_f is the mean of 1[log-odds >= b] (1[failed] - (1 - `share`)) over the trials of family
+    f.
 
     The r trials have the predicted `log_odds`. `held` says whether each grasp held, and `family`
     holds the number of its family of bodies.

@@ -308,15 +308,19 @@ class TrialSpec(Value):
     hold it.
 
     `close_hand` runs such a trial, and says when the object counts as held. The controller does not
-    know `mass`, `density`, `friction`, `gravity`, `patch` and the numbers of the simulator.
+    know `mass`, `density`, `friction`, `gravity`, `patch`, `table_friction`, `push`, `simulator`
+    and `timestep`.
+
+    The closing law is that of the paper (Eqs. 25-28). A fingertip's position is controlled while it
+    is far from its contact, and its force near the contact.
 
     Args:
         closing: how the hand closes.
-            "uncertainty": Eqs. 25-28 with the surface's calibrated standard deviations, and with
-              `options`.
+            "uncertainty": the closing law, with lower gains where the surface is more uncertain.
+              Its calibrated standard deviations are used. `options` apply.
             "fixed": the same with equal gains for all contacts.
-            "paper": Eqs. 25-28 as written, with forces of a learned stability model. They are
-              analytic if the hand's folder has no stability.safetensors.
+            "paper": the closing law as the paper prints it. A learned stability model gives the
+              desired forces. If the hand's folder has no stability.safetensors, a formula does.
             "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
             "position": PI control to goals behind the contacts.
             "open_loop": joint motion from pre-grasp to grasp to squeeze, the targets with which the
@@ -326,7 +330,7 @@ class TrialSpec(Value):
             "force": balanced forces, of which `force` sets the strength.
             "impedance": virtual springs keep the fingertips together and in place.
             "position": joint targets are kept.
-            "law": Eq. 25 continues.
+            "law": the closing law continues.
             None means "grip". It means "force" in three cases: `force` is given, the closing is
               neither "uncertainty" nor "fixed", or a fingertip has no working tactile sensor.
         mass: mass [kg] of the object, 0.001 to 10. From a `Distribution` each trial draws it by its
@@ -367,7 +371,7 @@ class TrialSpec(Value):
     * a number outside its range, or an unknown closing, holding or simulator;
     * `options` of a closing that has none;
     * a closing or holding that needs more than the `sensor` measures;
-    * the holding "law" after a closing that does not follow Eq. 25;
+    * the holding "law" after a closing other than "uncertainty", "fixed" and "paper";
     * the holding "grip" or "impedance" after the closing "open_loop";
     * a `max_force` with a holding that cannot keep it (`check_limit`);
     * a `force` above `max_force`, or a `table_friction` above the least `friction`;

@@ -50,10 +50,9 @@ class Joints(NamedTuple):
 class Mechanism(NamedTuple):
     """How the joints of a hand move: every joint leads, follows or stands still.
 
-    Motors set the positions of the leading joints, which are all others than these two kinds.
     `followers` holds, by name, how each following joint depends on leading ones. `still` holds, by
-    name, the positions [rad or m] of joints that nothing moves. `told` has sentences for the user
-    on under-actuated and on still joints.
+    name, the positions [rad or m] of joints that nothing moves. All other joints lead: motors set
+    their positions. `told` has sentences for the user on under-actuated and on still joints.
     """
 
     followers: dict[str, Mimic]

@@ -30,7 +30,10 @@ from torchgrasp.values.closing import ClosureResult
 
 @dataclasses.dataclass(frozen=True)
 class FilmLayout:
-    """Layout of a film strip: stills, and plots below them [pixels; fonts in points]."""
+    """Layout of a film strip: stills, and plots below them.
+
+    Lengths are in [pixels] and sizes of fonts in [points], unless it is said otherwise.
+    """
 
     dpi: int = 100  # resolution [pixels per inch]
     width: int = 1680  # width of the strip
@@ -54,7 +57,10 @@ class FilmLayout:
 
 @dataclasses.dataclass(frozen=True)
 class PlotStyle:
-    """Style of the plots in a film strip [points], and the least upper ends of their axes."""
+    """Style of the plots in a film strip, and the least upper ends of their axes.
+
+    Lengths and sizes of fonts are in [points], unless it is said otherwise.
+    """
 
     font: int = 13  # size of titles and of the texts of axes
     title_gap: int = 9  # gap between a title and its plot

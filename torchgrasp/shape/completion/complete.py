@@ -90,7 +90,9 @@ MIRROR = MirrorNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class BarNumbers:
-    """Parameters by which the thin bars of a frame-like object are found and completed."""
+    """Parameters for an object that is a frame of thin bars round an empty middle: how it is
+    recognised, and its bars completed.
+    """
 
     thin: float = 0.012
     """Width [m] below which a part of an object is a bar: that of a fingertip."""

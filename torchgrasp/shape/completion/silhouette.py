@@ -276,9 +276,11 @@ class Outlines(Value):
 
 @checked
 def silhouettes(cloud: PointCloud) -> Outlines:
-    """Return the silhouette of every view of a cloud [m].
+    """Return the silhouettes of a cloud [m]: for each view, the object's outline in the camera's
+    image and its visible depth.
 
-    Raises `BadArgument` for a view without viewpoint, or one that shows both sides of the object.
+    They are in the frame of the cloud, and a view is the points of one camera. Raises `BadArgument`
+    for a view without viewpoint, or one that shows both sides of the object.
     """
     views = cloud.split_views()
     if any(view.viewpoint is None for view in views):
@@ -287,8 +289,11 @@ def silhouettes(cloud: PointCloud) -> Outlines:
 
 
 def silhouette(view: PointCloud) -> Silhouette:
-    """Return the silhouette of one view [m]; raise `BadArgument` for one that shows both sides of
-    the object.
+    """Return the silhouette of one view: the object's outline in the camera's image and its visible
+    depth.
+
+    `view` holds points [m] of one camera; the silhouette is in their frame. Raises `BadArgument` if
+    the view shows both sides of the object.
 
     The outline is made from discs around the pixels of the view's points. Within the outline there
     may be gaps, where nothing was measured. A gap counts as a hole (free space) only if it is wide.
