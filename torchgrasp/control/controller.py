@@ -293,7 +293,7 @@ class GraspController:
 
         `cloud` holds points [m] of the object alone, in the frame of the planned cloud. Raises
         `BadArgument` if the hand has no approach, or has begun it. Raises it for a cloud whose
-        median point is over 50 mm off the surface, wherever the object stands within 80 mm.
+        median point is over 50 mm off the surface, wherever the object stands.
         """
         moved = self.locate(cloud)
         assert self.planned.surface is not None

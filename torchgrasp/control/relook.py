@@ -94,10 +94,7 @@ def check_seen_again(
     off = float(distance.abs().median())
     if off > RELOOK.off:
         found = f"points that are {1000 * off:.0f} mm off the object, wherever it stands"
-        allowed = (
-            "points in metres of the object alone, in the frame of the planned cloud, "
-            f"within {REACH:g} m of the planned place"
-        )
+        allowed = "points in metres of the object alone, in the frame of the planned cloud"
         raise BadArgument("cloud", found, allowed)
 
 
