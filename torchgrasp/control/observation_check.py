@@ -150,7 +150,7 @@ class ObservationCheck:
         kind = self.reference.sensor.kind
         if kind == "tactile":
             nowhere = np.isnan(tactile.points.numpy()).any(-1)
-            lacks = bool(touching.any()) and bool(nowhere[touching].all())
+            lacks = bool(touching.any()) and not bool((touching & ~nowhere).any())
             self.unplaced = self.unplaced + period if lacks else 0.0
             if self.unplaced > BOUNDS.unplaced:
                 found = "'tactile', with fingertips that touch and sense no contact points"
