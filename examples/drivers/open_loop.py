@@ -114,7 +114,7 @@ def close_open_loop(
     """Go from where the hand is to the pre-grasp, the grasp and the squeeze; return how it ended.
 
     That is "held", with the drives pressing on, or why the hand was stopped. The hand is stopped
-    within a tick when `stop` is set, and when a reading is old or no number. It is also stopped
+    within a tick when `stop` is set, and when a reading is old, by another clock, or no number. It is also stopped
     when a joint is blocked before the squeeze, and by any error.
     """
     reach = closing.limits / closing.kp
@@ -163,6 +163,8 @@ def _find_fault(
         return "asked to stop"
     if age > numbers.stale:
         return f"no reading for {age:.2f} s"
+    if age < -numbers.stale:
+        return f"a reading {-age:.2f} s ahead of the clock: both must be one clock"
     if not bool(torch.isfinite(joints).all()):
         return "a reading that is no number"
     behind = float((goal - joints).abs().max())

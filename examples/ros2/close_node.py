@@ -28,6 +28,8 @@ from torchgrasp.values.closing import SensorModel
 OPENING = 0.5  # greatest speed [rad/s] of a joint on its way to the pre-grasp
 # time [s] without joint states after which nothing is sent: the driver then keeps its last targets
 SILENCE = 0.1
+# distance [rad] of the first state from the pre-grasp that no finger has: it is in degrees
+FAR = math.pi
 
 
 class Driver(NamedTuple):
@@ -93,7 +95,7 @@ class HandLoop:
 
         They are in the order of `names`, those of the message, which may have further joints.
         Without names they are in the driver's order. Raises `BadArgument` for a joint that the
-        names lack.
+        names lack, and for a first state far off the pre-grasp, as one in degrees.
         """
         if len(names):
             at = {name: place for place, name in enumerate(names)}
@@ -105,10 +107,14 @@ class HandLoop:
             positions = [positions[at[name]] for name in self.names]
         if len(positions) == len(self.names) and all(map(math.isfinite, positions)):
             first = self.measured is None
+            joints = torch.tensor(list(positions), dtype=torch.float64)[self.back]
+            joints = joints - self.driver.zero
+            off = float((joints - self.pregrasp).abs().max())
+            if first and off > FAR:
+                found = f"a joint {off:.1f} off the pre-grasp"
+                raise BadArgument("positions", found, "radians, with the driver's zero")
             self.silent = 0
-            self.measured = (
-                torch.tensor(list(positions), dtype=torch.float64)[self.back] - self.driver.zero
-            )
+            self.measured = joints
             self.sent = self.measured if first else self.sent  # the hand opens from where it is
 
     def close(self) -> bool:

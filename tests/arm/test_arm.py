@@ -156,3 +156,20 @@ def test_a_published_arm_with_meshes_is_cleaned_for_the_library(hand, tmp_path):
         torch.cdist(torch.from_numpy(np.array(body.vertices)), arm.center[mine]) - arm.radius[mine]
     )
     assert mine.sum() > 4 and far.amin(1).max() < 0.002
+
+
+def test_joints_in_degrees_are_refused_and_an_arm_keeps_its_pose(tmp_path):
+    """A base that is moved in the same memory, for a second arm, moves no first one."""
+    file = tmp_path / "ur5e.urdf"
+    file.write_text(ur5e_urdf())
+    base = random_motion(5)
+    mount = torch.eye(4, dtype=torch.float64)
+    arm = load_arm(file, "allegro", "tool0", obj_from_base=base, tip_from_hand=mount)
+    joints = torch.tensor([[0.3, -1.2, 1.5, -0.4, 1.57, 0.0]], dtype=torch.float64)
+    pose = arm.hand_poses(joints)
+    base[:3, 3] += 1.0
+    mount[2, 3] = 0.1
+    assert torch.equal(arm.hand_poses(joints), pose)
+    arm.hand_poses(arm.upper[None] + 0.1)
+    with pytest.raises(BadArgument, match=r"joints: .*radians"):
+        arm.hand_poses(torch.rad2deg(joints))

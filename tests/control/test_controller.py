@@ -18,13 +18,14 @@ from tests.point_fingers import (
     real,
     reference,
 )
-from torchgrasp import Plane, TrialSpec, load_hand
+from torchgrasp import ClosingReference, Plane, TrialSpec, load_hand
 from torchgrasp.control import no_contact, observe
 from torchgrasp.control.controller import CLOSING_TIME, GraspController
 from torchgrasp.control.finger_forces import desired_forces
 from torchgrasp.control.holding import RAMP, ForceHold, GripHold, held_forces
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.control.recovery import PRESSING_TIME
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import fibonacci_sphere
 from torchgrasp.geometry.signed_distance import SignedDistanceField
@@ -242,3 +243,12 @@ def test_measured_joints_in_degrees_are_refused_and_overshoot_is_not():
     with pytest.raises(BadArgument, match="radians"):
         observe(hand, middle * 180 / torch.pi, no_contact())
     observe(hand, middle, no_contact())
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_a_table_in_the_frame_of_the_cloud_is_refused_also_where_the_plan_had_none(name):
+    reference = ClosingReference.from_grasp(load_hand(name), load_shipped_grasp("jug", name))
+    without = dataclasses.replace(reference, planned_table=None)
+    GraspController(dataclasses.replace(without, table=reference.planned_table))
+    with pytest.raises(BadArgument, match=r"reference\.table.*hand_from_obj"):
+        GraspController(dataclasses.replace(without, table=Plane.horizontal(0.0)))

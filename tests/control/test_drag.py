@@ -12,7 +12,7 @@ import torch
 from tests.make import load_hand, near, real
 from tests.settings import other_settings
 from torchgrasp import Plane, Status
-from torchgrasp.control import Observation, TipContact, measure, no_contact
+from torchgrasp.control import Observation, TipContact, feel_flags, measure, no_contact, observe
 from torchgrasp.control.drag import DRAGGING, DragController
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
@@ -249,3 +249,18 @@ def test_targets_have_the_same_bits_under_any_setting_of_torch():
     near(single.palm, plain.palm, 1e-6)
     turn = inverse(world.plan.obj_from_hand)[:3, :3]
     near(plain.palm, (DRAGGING.height - DRAGGING.fastest * PERIOD) * (turn @ UP), 1e-9)
+
+
+def test_an_observation_of_another_hand_and_flags_without_forces_are_refused():
+    hand, plan, _ = made("allegro")
+    controller = DragController(plan, hand)
+    four = load_hand("allegro", fingers="four")
+    other = observe(four, (four.lower + four.upper) / 2, no_contact(fingers=4))
+    with pytest.raises(BadArgument, match=r"observation: .*3 fingertips"):
+        controller.step(other, PERIOD)
+    flags = feel_flags(no_contact(), torch.tensor([True, True, True]))
+    with pytest.raises(BadArgument, match="feel_flags"):
+        controller.step(observe(hand, plan.joints, flags), PERIOD)
+    before = controller.height
+    controller.step(observe(hand, plan.joints, no_contact()), PERIOD)
+    assert controller.height < before

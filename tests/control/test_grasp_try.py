@@ -22,10 +22,11 @@ from tests.point_fingers import (
     real,
 )
 from torchgrasp import GraspController
-from torchgrasp.control import GraspTry
+from torchgrasp.control import GraspTry, no_contact
 from torchgrasp.control.regrasp import next_grasp
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
+from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 
@@ -182,3 +183,18 @@ def test_grasps_that_failed_a_check_are_not_tried():
     assert GraspTry(grasps, start, tried=(0, 2)).next() is None
     with pytest.raises(BadArgument, match=r"tried: .*executable"):
         GraspTry(grasps, start, tried=(1,))
+
+
+def test_a_surface_in_the_frame_of_the_hand_and_a_motion_that_is_changed_later_move_nothing():
+    grasps = around(0.0, 90.0)
+    far = SignedDistanceField(real([0.3, 0.0, 0.0]), 0.01, torch.ones(4, 4, 4).double())
+    for ask in (lambda: GraspTry(grasps, start, far), lambda: next_grasp(grasps, [0], far)):
+        with pytest.raises(BadArgument, match=r"surface.*frame of the grasp"):
+            ask()
+    moved = rigid(torch.eye(3).double(), real([0.02, 0.0, 0.0]))
+    attempt = GraspTry(grasps, start, moved=moved)
+    moved[0, 3] = 9.0
+    assert float(attempt.moved[0, 3]) == 0.02
+    other = dataclasses.replace(observation(), tactile=no_contact(fingers=4))
+    with pytest.raises(BadArgument, match=r"observation: .*3 fingertips"):
+        attempt.withdraw(other, PERIOD, 0.1)

@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from tests.point_fingers import FREE, PERIOD, TOUCHING, observation, on_table
+from torchgrasp.control import no_contact
 from torchgrasp.control.recovery import LiftCheck
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.values.closing import SensorModel
 
 ONE = torch.tensor([True, False, False])
@@ -97,3 +99,36 @@ def test_without_forces_or_table_the_touches_tell():
         on_table(), sensor=SensorModel("binary", dead=(on_table().hand.finger_names[2],))
     )
     assert not LiftCheck(dead)(observation(0.0, contact=ONE), 0.03, PERIOD)
+
+
+def test_a_height_above_the_base_a_far_jump_and_another_hand_are_refused():
+    """The hand rises from the height 0."""
+    check = LiftCheck(on_table())
+    with pytest.raises(BadArgument, match=r"height: .*start of the lift"):
+        check(observation(0.0, contact=TOUCHING), 0.65, PERIOD)
+    with pytest.raises(BadArgument, match="height"):
+        check(observation(0.0, contact=TOUCHING), 50.0, PERIOD)  # in millimetres
+    for height in (0.0, 0.2, 0.4, 0.1):
+        assert not check(observation(0.0, contact=TOUCHING), height, PERIOD)
+    four = dataclasses.replace(observation(0.0), tactile=no_contact(fingers=4))
+    with pytest.raises(BadArgument, match=r"observation: .*3 fingertips"):
+        check(four, 0.1, PERIOD)
+
+
+def test_a_broken_sensor_shows_neither_a_load_nor_a_slide():
+    """Without the broken one, one fingertip touches, and no load is felt."""
+    names = on_table().hand.finger_names
+    dead = dataclasses.replace(on_table(), sensor=SensorModel(dead=names[1:]))
+    seen = observation(0.0, contact=FREE)
+    loud = dataclasses.replace(
+        seen.tactile,
+        forces=torch.tensor([[0.0] * 3, [0.0, 9.0, 0.0], [0.0] * 3]).double(),
+        sliding=torch.tensor([0.0, 9.0, 9.0]).double(),
+    )
+    checks = [LiftCheck(dead), LiftCheck(dead)]
+    for _ in range(50):
+        silent, noisy = (
+            check(dataclasses.replace(seen, tactile=tactile), 0.015, PERIOD)
+            for check, tactile in zip(checks, (seen.tactile, loud), strict=True)
+        )
+        assert silent == noisy

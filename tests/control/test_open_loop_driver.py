@@ -153,6 +153,16 @@ def test_old_readings_stop_the_hand(mock):
     assert driver.stops == 1
 
 
+def test_readings_by_another_clock_stop_the_hand(mock):
+    """They would never be old: the time of the day beside that since the start."""
+    closing = closing_of()
+    driver = mock(closing)
+    driver.read = lambda: (1.7e9, driver.joints)
+    ended = close_open_loop(driver, closing, threading.Event())
+    assert "one clock" in ended and driver.stops == 1
+    assert len(driver.torques) == 1
+
+
 def test_a_reading_that_is_no_number_stops_the_hand(mock):
     closing = closing_of()
     driver = mock(closing)

@@ -122,3 +122,23 @@ def test_a_camera_beside_the_hand_finds_an_object_six_centimetres_away():
         0,
         1,
     ) and found.before_lift.distance < 0.005
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        1000 * seen_ball(real([0, 0, 0])).points,  # in millimetres
+        seen_ball(real([0.6, 0, 0])).points,  # too far away to be found
+        apply(
+            rigid(rotation_from_vector(real([1.0, 2.0, 0.5])), real([0.2, 0.3, 0.1])),
+            seen_ball(real([0, 0, 0])).points,
+        ),  # in the camera's frame
+    ],
+)
+def test_a_view_in_another_frame_or_unit_moves_nothing(wrong):
+    controller = GraspController(above(), approach=LENGTH)
+    before = controller.targets.palm
+    with pytest.raises(BadArgument, match=r"cloud.*planned cloud"):
+        controller.relook(PointCloud(wrong))
+    assert torch.equal(controller.targets.palm, before)
+    controller.relook(seen_ball(real([0.05, 0, 0.03])))

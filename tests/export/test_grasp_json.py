@@ -16,8 +16,15 @@ from torchgrasp import Plane, load_hand
 from torchgrasp.app import cli
 from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.export import format_grasps, format_isaac, format_keyframes, format_moveit
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.export import (
+    format_grasps,
+    format_isaac,
+    format_keyframes,
+    format_moveit,
+    grasps_from_joints,
+    read_foreign,
+)
+from torchgrasp.foundation.errors import BadArgument, ModelFileError
 from torchgrasp.geometry.frames import apply
 
 HANDS = ["allegro", "barrett"]
@@ -166,3 +173,20 @@ def test_a_flange_in_millimetres_and_grasps_in_degrees_are_refused(write):
     longer = dataclasses.replace(grasp, approach=2.0 * grasp.approach)
     with pytest.raises(BadArgument, match=r"grasps.approach: .*unit"):
         write(hand, longer)
+
+
+def test_a_unit_that_contradicts_the_file_is_refused_and_grasps_keep_their_numbers(tmp_path):
+    """A caller may read the next grasp into the same memory."""
+    hand = load_hand("barrett")
+    grasp = load_shipped_grasp("jug", "barrett")
+    file = tmp_path / "grasps.json"
+    file.write_text(format_grasps(hand, grasp))
+    with pytest.raises(ModelFileError, match=r"units\.length|metres"):
+        read_foreign(file, hand, unit_m=0.001)
+    memory = [x.clone() for x in (grasp.joints, grasp.obj_from_hand, grasp.pregrasp)]
+    read = grasps_from_joints(hand, *memory)
+    for x in memory:
+        x.mul_(0.0)
+    np.testing.assert_allclose(read.joints, grasp.joints, atol=1e-12)
+    np.testing.assert_allclose(read.obj_from_hand, grasp.obj_from_hand, atol=1e-12)
+    np.testing.assert_allclose(read.pregrasp, grasp.pregrasp, atol=1e-12)

@@ -162,8 +162,29 @@ def test_joints_that_follow_are_left_out_on_demand_and_names_are_the_robots(tmp_
     (one,) = yaml.safe_load(path.read_text())["grasps"].values()
     for key in KEYS - {"confidence", "position", "orientation"}:
         assert set(one[key]) == {"right_spread", "f1_flex", "f2_flex", "f3_flex"}
+    text = path.read_text()
+    path.write_text("".join(x for x in text.splitlines(True) if "names here" not in x))
     with pytest.raises(ModelFileError, match=r"grasp_0\.cspace_position with 'right_spread'"):
         read_foreign(path, hand)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        {"joint_0": "joint_1", "joint_1": "joint_0"},  # of another numbering of the same hand
+        {"joint_12": "joint_0", "joint_0": "thumb\n1", "joint_9": "9"},
+    ],
+)
+def test_a_file_with_the_names_of_a_robot_comes_back(tmp_path, names):
+    hand, grasp, path = written(tmp_path, "allegro", rename=names)
+    read = read_foreign(path, hand)
+    np.testing.assert_allclose(read.joints, grasp.joints, atol=1e-9)
+    np.testing.assert_allclose(read.pregrasp, grasp.pregrasp, atol=1e-9)
+    good = json.dumps(names)
+    for wrong in ("[1]", "{", '{"wrist": "a"}', '{"joint_0": 3}', '{"joint_0": "joint_1"}'):
+        path.write_text(format_isaac(hand, grasp, rename=names).replace(good, wrong))
+        with pytest.raises(ModelFileError):
+            read_foreign(path, hand)
 
 
 EDITOR = """

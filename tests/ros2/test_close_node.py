@@ -168,3 +168,13 @@ def test_the_leap_gets_motors_in_its_order_about_a_half_turn(tmp_path):
     opened = hand.expand(loop.reference.pregrasp)
     for k, position in enumerate(driver.commands[-1].position):
         assert position == pytest.approx(np.pi + float(opened[str(k)]))
+
+
+def test_a_first_state_in_degrees_moves_nothing(file):
+    loop = close_node.HandLoop(close_node.Settings(file))
+    degrees = torch.rad2deg(loop.pregrasp)[loop.order].tolist()
+    with pytest.raises(BadArgument, match="positions: expected radians"):
+        loop.hear(degrees)
+    assert loop.tick() is None
+    loop.hear(loop.pregrasp[loop.order].tolist())
+    assert loop.tick() is not None

@@ -53,6 +53,8 @@ class ArmNumbers:
     """Distance [m] by which a sphere may protrude from a shape."""
     mount: float = 1.0
     """Largest distance [m] of a hand from the arm's tip: a larger one is in millimetres."""
+    astray: float = 1.0
+    """Distance [rad or m] of a joint beyond its limits that no encoder's error explains."""
 
 
 ARM = ArmNumbers()
@@ -135,7 +137,14 @@ class Arm(Value):
 
         Args:
             joints: positions (k, n) of the arm's n joints [rad, or m for sliding joints].
+
+        Raises `BadArgument` for a joint over 1 rad or 1 m beyond its limits, as one in degrees.
         """
+        beyond = torch.maximum(self.lower - joints, joints - self.upper).amax(0)
+        if len(joints) and float(beyond.max()) > ARM.astray:
+            name = self.joint_names[int(beyond.argmax())]
+            found = f"{name} {float(beyond.max()):.3g} beyond its limits"
+            raise BadArgument("joints", found, "positions in radians, or metres of sliding joints")
         return self.obj_from_base @ self.tree.poses(joints)[:, -1] @ self.tip_from_hand
 
     @checked
@@ -288,7 +297,8 @@ def load_arm(
     reach = ((upper - lower) / 2).clamp_max(math.pi)
     library = (lower + upper) / 2 + share * reach
     same = torch.eye(4, dtype=torch.float64, device="cpu")
-    base, mount = (same if x is None else x.to(same) for x in (obj_from_base, tip_from_hand))
+    given = obj_from_base, tip_from_hand
+    base, mount = (same if x is None else x.to(same, copy=True) for x in given)
     away = float(norm(mount[:3, 3]))
     if away > ARM.mount:
         found = f"a hand {away:g} m from the tip"

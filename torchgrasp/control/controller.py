@@ -15,6 +15,7 @@ from torch import Tensor
 from torchgrasp.control.holding import GripHold
 from torchgrasp.control.modes import choose_holding, make_closing
 from torchgrasp.control.object_pose import Touches
+from torchgrasp.control.observation_check import ObservationCheck
 from torchgrasp.control.protocol import Closing, LawClosing
 from torchgrasp.control.recovery import (
     PRESSING_TIME,
@@ -24,13 +25,20 @@ from torchgrasp.control.recovery import (
     can_guard,
 )
 from torchgrasp.control.reference import ClosingReference, check_plan
-from torchgrasp.control.relook import relocate
-from torchgrasp.control.tactile import EARLY, STILL, Observation, Targets
+from torchgrasp.control.relook import check_seen_again, relocate
+from torchgrasp.control.tactile import (
+    EARLY,
+    STILL,
+    Observation,
+    Targets,
+    check_observation,
+    silenced,
+)
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.foundation.base import check_device, map_tensors, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
-from torchgrasp.foundation.rules import Range
+from torchgrasp.foundation.rules import Pose, Range
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector, turned_about
 from torchgrasp.geometry.linalg import check_unit_vectors, dot
 from torchgrasp.values.closing import ClosingOptions, choose_options
@@ -118,6 +126,8 @@ class GraspController:
         self.mode: ClosingMode = closing
         self.path = STILL  # displacement [m] of the palm's path by a new view
         self.planned = settle(reference, torch.device("cpu"))
+        self.whole = bool(self.planned.alive.all())  # whether all sensors work
+        self.check_seen = ObservationCheck(self.planned)
         self._prepare(self.planned, approach)
 
     def _check_force(
@@ -282,15 +292,45 @@ class GraspController:
         planned pose. The palm does not rotate: the contacts of a turned object are found by touch.
 
         `cloud` holds points [m] of the object alone, in the frame of the planned cloud. Raises
-        `BadArgument` if the hand has no approach, or has begun it.
+        `BadArgument` if the hand has no approach, or has begun it. Raises it for a cloud whose
+        median point is over 50 mm off the surface, wherever the object stands.
+        """
+        moved = self.locate(cloud)
+        assert self.planned.surface is not None
+        check_seen_again(self.planned.surface, cloud, moved)
+        self.follow(moved)
+
+    @checked
+    def locate(self, cloud: PointCloud) -> Float[Tensor, "4 4"]:
+        """Return the motion (4, 4) [m] of the object along its table, as a new view shows it.
+
+        It is a rigid transform from the planned to the present object, in the frame of the planned
+        cloud. `cloud` holds points [m] of the object alone, in this frame. Raises `BadArgument` if
+        the hand has no approach, or has begun it.
         """
         reference = self.planned
+        self._check_begun()
+        assert reference.surface is not None and reference.table is not None
+        return relocate(reference.surface, cloud, reference.table.moved(reference.obj_from_hand))
+
+    def _check_begun(self) -> None:
+        """Raise `BadArgument` if the hand has no approach, or has begun it."""
         if self.guard is None or self.guard.left < self.guard.length:
             found = "a view of the object after the start of the approach"
             raise BadArgument("cloud", found, "one before it")
-        assert reference.surface is not None and reference.table is not None
-        moved = relocate(reference.surface, cloud, reference.table.moved(reference.obj_from_hand))
+
+    @checked
+    def follow(self, moved: Pose) -> None:
+        """Shift the approach to an object that has `moved`, as `relook` does.
+
+        `moved` (4, 4) [m] is the motion of the object since the plan, in the frame of the planned
+        cloud. Raises `BadArgument` if the hand has no approach, or has begun it.
+        """
+        reference = self.planned
+        self._check_begun()
+        assert self.guard is not None
         # the object's motion in the hand's frame; the palm follows its shift alone
+        moved = moved.to("cpu", torch.float64)
         in_hand = inverse(reference.obj_from_hand) @ moved @ reference.obj_from_hand
         centre = reference.gains.target.mean(0)
         self.path = apply(in_hand, centre[None])[0] - centre
@@ -310,19 +350,30 @@ class GraspController:
             period: time [s] until the next tick, 1e-5 to 1.
 
         Raises `BadArgument` for an observation of another hand or on another device, or a period
-        out of range.
+        out of range. For one that `observe` made, raises it also for:
+
+        * a joint that jumps, or is over 0.8 rad off the pre-grasp where the closing begins;
+        * an `up` over 0.5 rad off the table's normal before the hand holds;
+        * a normal force below -1 N, or above 1000 N, as one in millinewtons;
+        * a fingertip that touches with a force that pulls at the object;
+        * its contact point over 0.1 m from its centre, as in another frame or unit;
+        * its normal that is no unit vector, or points into the object;
+        * tactile fingertips that touch for 0.5 s without a contact point;
+        * torques by which all fingertips pull for 0.3 s while they close, by 5 N together.
         """
-        shape = len(self.reference.normals), 3, len(self._sent.joints)
-        found = tuple(observation.jacobian.shape)
-        if found != shape or observation.tactile.reading.shape != shape[:1]:
-            told = f"fingertips, 3 and joints {found}"
-            raise BadArgument("observation", told, f"those of the hand, {shape}")
+        check_observation(self.reference.hand, observation)
         device = self._sent.joints.device
         check_device("observation", observation.joints.device, "the controller", device)
         if observation.up is not None:
             check_unit_vectors("observation.up", observation.up)
         # what is remembered must stay: a robot may read its sensors into the same memory
         observation = map_tensors(torch.clone, observation)
+        if not self.whole:
+            tactile = silenced(observation.tactile, self.reference.alive)
+            observation = dataclasses.replace(observation, tactile=tactile)
+        if observation.hand:
+            closes = self.guard is None and self.reopening is None
+            self.check_seen(observation, period, closes, self.hold is not None)
         if self.guard is not None:
             self._sent = self._approach(self.guard, observation, period)
         elif self.reopening is not None:

@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.control.sensing import WAITING_FORCE
 from torchgrasp.control.smooth import smooth_step
-from torchgrasp.control.tactile import Observation, Targets
+from torchgrasp.control.tactile import Observation, TactileState, Targets, check_observation
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Range
@@ -116,6 +117,7 @@ class DragController:
             raise BadArgument("plan", "no displacement", "one along the table")
         turn = plan.obj_from_hand[:3, :3]
         self.plan = plan
+        self.hand = hand
         self.up = plan.table.normal @ turn
         self.way = plan.displacement @ turn
         self.presses = plan.presses
@@ -154,8 +156,11 @@ class DragController:
             observation: what the hand measures now.
             period: time [s] until the next control tick, 1e-5 to 1.
 
-        Raises `BadArgument` for a period outside 1e-5 to 1 s.
+        Raises `BadArgument` for a period outside 1e-5 to 1 s, an observation of another hand, and
+        readings of `feel_flags`, which have no forces.
         """
+        check_observation(self.hand, observation)
+        self._check_forces(observation.tactile)
         reading = observation.tactile.reading.where(self.presses, 0.0)
         force = float(reading.sum())
         if self.phase == "down":
@@ -168,6 +173,13 @@ class DragController:
             if self.height >= DRAGGING.height:
                 self.phase = "done"
         return self.targets
+
+    def _check_forces(self, tactile: TactileState) -> None:
+        """Raise `BadArgument` for readings of fingertips that sense only whether they touch."""
+        flags = tactile.contact & (tactile.reading == WAITING_FORCE)
+        if bool((flags & (tactile.forces == 0.0).all(-1)).any()):
+            found = "those of `feel_flags`, which have no forces"
+            raise BadArgument("observation.tactile", found, "readings of forces, in newtons")
 
     def _press(self, force: float, period: float) -> None:
         """Come down, and press with the planned force; give up if nothing is there."""

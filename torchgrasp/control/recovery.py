@@ -18,9 +18,10 @@ from torchgrasp.contacts.balance import least_friction_forces, tangential_ratio
 from torchgrasp.control.object_pose import Localization, Touches
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.sensing import TORQUE_NOISE
-from torchgrasp.control.tactile import EARLY, Observation, smooth
+from torchgrasp.control.tactile import EARLY, Observation, check_observation, silenced, smooth
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.linalg import limit_norm, norm, unit
 from torchgrasp.geometry.plane import Plane
@@ -90,6 +91,8 @@ class LostNumbers:
     """Height [m] of the lift up to which slides are summed."""
     slip: float = 0.0015
     """Distance [m] that two fingertips each slide, beyond which the hand will lose the object."""
+    rise: float = 0.3
+    """Largest rise [m] between two ticks: a larger one is a height above the robot's base."""
 
 
 APPROACH = ApproachNumbers()
@@ -417,7 +420,10 @@ class LiftCheck:
 
     @checked
     def __init__(self, reference: ClosingReference) -> None:
+        self.hand = reference.hand
         self.alive = reference.alive
+        self.whole = bool(self.alive.all())  # whether all sensors work
+        self.height = 0.0  # at the last tick [m]
         self.lost = False
         self.load = 0.0
         self.slid = torch.zeros(len(self.alive), dtype=torch.float64)  # by each fingertip [m]
@@ -425,16 +431,29 @@ class LiftCheck:
 
     @checked
     def __call__(
-        self, observation: Observation, height: float, period: Annotated[float, Range(1e-5, 1.0)]
+        self,
+        observation: Observation,
+        height: Annotated[float, Range(-1.0, 10.0)],
+        period: Annotated[float, Range(1e-5, 1.0)],
     ) -> bool:
         """Return whether the object is lost (`lost`) at the end of a tick of the lift.
 
         Args:
             observation: what the hand measures at the end of the tick (`observe`).
-            height: height [m] to which the hand has risen.
+            height: height [m] of the hand above its position at the start of the lift, -1 to 10.
             period: length [s] of the tick, 1e-5 to 1.
+
+        Raises `BadArgument` for an observation of another hand, a number out of range, and a rise
+        by over 0.3 m in a tick. The first tick counts from 0.
         """
+        check_observation(self.hand, observation)
+        if height - self.height > LOST.rise:
+            found = f"{height:g} m, {height - self.height:g} m above that of the last tick"
+            raise BadArgument("height", found, "the height in metres above the start of the lift")
+        self.height = height
         tactile = observation.tactile
+        if not self.whole:
+            tactile = silenced(tactile, self.alive)
         if height <= LOST.low:
             self.slid = self.slid + period * tactile.sliding
         if self.table is not None:

@@ -280,6 +280,10 @@ class PlanNumbers:
     """Largest distance [m] between these two tables at the planned contacts."""
     surface: float = 0.05
     """Largest median distance [m] of the planned contacts from the estimated surface."""
+    below: float = 0.015
+    """Largest depth [m] of a planned contact under the table."""
+    upward: float = 0.5
+    """Largest component of the approach along the table's normal: no hand comes from below."""
 
 
 PLAN = PlanNumbers()
@@ -314,13 +318,40 @@ def check_plan(reference: ClosingReference) -> None:
             found = f"one {degrees:.0f} degrees and {1000 * off:.0f} mm off that of the grasp"
             allowed = "that in the hand's frame: `grasp.table.moved(hand_from_obj)`"
             raise BadArgument("reference.table", found, allowed)
+    elif reference.table is not None and reference.table.edge is None:
+        _check_told_table(reference, reference.table)
     if reference.surface is not None:
-        distance, _ = reference.surface.query(apply(reference.obj_from_hand, points))
-        off = float(distance.abs().median())
-        if off > PLAN.surface:
-            found = f"one {1000 * off:.0f} mm off the planned contacts"
-            allowed = "the estimated surface of this object, in the frame of the grasp"
-            raise BadArgument("reference.surface", found, allowed)
+        check_surface(
+            "reference.surface", reference.surface, apply(reference.obj_from_hand, points)
+        )
+
+
+def _check_told_table(reference: ClosingReference, table: Plane) -> None:
+    """Raise `BadArgument` for the table of a grasp without one if contacts are below it, or the
+    hand comes from below.
+    """
+    lowest = float(table.height(reference.gains.target).min())
+    found = ""
+    if lowest < -PLAN.below:
+        found = f"one {-1000 * lowest:.0f} mm above a planned contact"
+    elif reference.approach is not None and float(reference.approach @ table.normal) > PLAN.upward:
+        found = "one from below which the hand approaches"
+    if found:
+        allowed = "that in the hand's frame: `table.moved(hand_from_obj)`"
+        raise BadArgument("reference.table", found, allowed)
+
+
+def check_surface(name: str, surface: SignedDistanceField, points: Float[Tensor, "*b 3"]) -> None:
+    """Raise `BadArgument` for an estimated surface that is not at the planned contacts.
+
+    `points` [m] are the contacts in the frame of the surface, `name` is that of the surface.
+    """
+    distance, _ = surface.query(points)
+    off = float(distance.abs().median())
+    if off > PLAN.surface:
+        found = f"one {1000 * off:.0f} mm off the planned contacts"
+        allowed = "the estimated surface of this object, in the frame of the grasp"
+        raise BadArgument(name, found, allowed)
 
 
 def check_single(grasp: Grasps) -> None:

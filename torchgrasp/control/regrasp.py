@@ -13,8 +13,9 @@ from torch import Tensor
 
 from torchgrasp.control.controller import GraspController, Period
 from torchgrasp.control.recovery import LiftCheck, Reopening
+from torchgrasp.control.reference import check_surface
 from torchgrasp.control.smooth import smooth_step
-from torchgrasp.control.tactile import Observation, Targets
+from torchgrasp.control.tactile import Observation, Targets, check_observation
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
@@ -59,8 +60,10 @@ def next_grasp(
     (`list_others`). `surface` is the estimated surface of the object, in the frame of the grasps.
     With it, a failure shifts the likely centre of mass, and so the chances of the others. The first
     of the other grasps is returned in three cases: `surface` is None, the grasps have no table, or
-    they are not ranked by success. Raises `BadArgument` if no other grasp is left.
+    they are not ranked by success. Raises `BadArgument` if no other grasp is left, or if the
+    surface is over 50 mm off the contacts.
     """
+    _check_surface(grasps, surface)
     others = list_others(grasps, tried)
     if not len(others):
         raise BadArgument("tried", list(tried), "fewer grasps, so that another one is left to try")
@@ -83,6 +86,13 @@ def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
     gaps = norm(points[:, None] - points[list(tried)]).mean(-1)  # (g, t)
     differs = (gaps > REGRASP.gap) | (approach @ approach[list(tried)].T < math.cos(REGRASP.turn))
     return flatnonzero(differs.all(-1) & (grasps.status == Status.OK))
+
+
+def _check_surface(grasps: Grasps, surface: SignedDistanceField | None) -> None:
+    """Raise `BadArgument` for a surface that is not at the contacts of the grasps."""
+    if surface is not None and len(grasps):
+        points = grasps.contacts.points.to(surface.values.device, torch.float64)
+        check_surface("surface", surface, points)
 
 
 def _chances(
@@ -131,7 +141,8 @@ class GraspTry:
             that moves with the object. Transform a cloud for `relook` by the inverse of `moved`.
 
     Raises `BadArgument` if `tried` is empty, or an index in it is none of the grasps. Raises it if
-    the grasp of this try failed a check of the planner.
+    the grasp of this try failed a check of the planner, or if the surface is over 50 mm off the
+    contacts.
     """
 
     @checked
@@ -149,12 +160,15 @@ class GraspTry:
         if status is not Status.OK:
             found = f"grasp {tried[-1]}, which failed: {status.sentence}"
             raise BadArgument("tried", found, "rows of executable grasps")
+        _check_surface(grasps, surface)
         self.grasps = grasps
         self.start = start
         self.surface = surface
         self.tried = tuple(tried)
         self.row = self.tried[-1]
-        self.moved = torch.eye(4, dtype=torch.float64) if moved is None else moved.cpu().double()
+        self.moved = (
+            torch.eye(4, dtype=torch.float64) if moved is None else moved.cpu().double().clone()
+        )
         self.controller = start(grasps[self.row])
         self.check = LiftCheck(self.controller.reference)
 
@@ -207,7 +221,8 @@ class GraspTry:
             height: height [m] of the hand above its position at the start of the lift.
             period: length [s] of the tick, 1e-5 to 1.
 
-        Raises `BadArgument` for a period out of range, or a height outside [-1, 10] m.
+        Raises `BadArgument` for an observation of another hand, a period out of range, a height
+        outside [-1, 10] m, or a rise by over 0.3 m in a tick.
         """
         self.check(observation, height, period)
         return self.failed
@@ -229,8 +244,10 @@ class GraspTry:
             period: length [s] of a tick, 1e-5 to 1.
             length: distance [m] by which the hand withdraws against its approach, at most 1.
 
-        Raises `BadArgument` for a period or a length out of range.
+        Raises `BadArgument` for an observation of another hand, or a period or a length out of
+        range.
         """
+        check_observation(self.controller.reference.hand, observation)
         return Withdrawal(self.controller, observation, period, length)
 
     def next(self) -> "GraspTry | None":

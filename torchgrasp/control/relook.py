@@ -7,7 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.checks import checked
-from torchgrasp.geometry.frames import rotation_from_vector, turned_about
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.geometry.frames import apply, inverse, rotation_from_vector, turned_about
 from torchgrasp.geometry.linalg import across, matvec, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
@@ -42,6 +43,10 @@ class RelookNumbers:
     """Largest change of each component of a motion in one step [m, m, rad]."""
     std: tuple[float, float, float] = (0.05, 0.05, 0.2)
     """Standard deviations of a motion under the weak prior [m, m, rad]."""
+    off: float = 0.05
+    """Largest median distance [m] of the new points from the moved surface: beyond it the points
+    are in another frame or unit, not of the object alone, or too far away.
+    """
 
 
 RELOOK = RelookNumbers()
@@ -77,6 +82,20 @@ def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> F
     found = motions[search.cost(distance).argmin()]
     rotation = rotation_from_vector(found[2] * search.up)
     return turned_about(rotation, search.pivot, found[:2] @ search.axes)
+
+
+def check_seen_again(
+    surface: SignedDistanceField, cloud: PointCloud, moved: Float[Tensor, "4 4"]
+) -> None:
+    """Raise `BadArgument` for a new cloud that is far off the surface, though this was `moved`
+    (`relocate`).
+    """
+    distance, _ = surface.query(apply(inverse(moved), cloud.points.double().cpu()))
+    off = float(distance.abs().median())
+    if off > RELOOK.off:
+        found = f"points that are {1000 * off:.0f} mm off the object, wherever it stands"
+        allowed = "points in metres of the object alone, in the frame of the planned cloud"
+        raise BadArgument("cloud", found, allowed)
 
 
 class _Registration:

@@ -6,6 +6,7 @@ A robot with such sensors makes its `TactileState` with `feel_flags` or `feel_to
 """
 
 import dataclasses
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,12 +24,12 @@ from torchgrasp.control.tactile import (
     flag,
     measure,
     no_contact,
+    silenced,
     smooth,
 )
-from torchgrasp.foundation.base import map_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import Positive
+from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.linalg import dot, norm
 
 WAITING_FORCE = 0.3
@@ -36,6 +37,8 @@ WAITING_FORCE = 0.3
 sensor in contact.
 """
 TORQUE_NOISE = 0.01  # standard deviation [N m] of a sensed joint torque
+# largest torque that is felt, as a multiple of the strongest drive's: a blow; more is another unit
+MOST_TORQUE = 10.0
 SWITCH_ON = 0.45  # reading [N] at which a binary contact closes; it opens at `TOUCH_ON`
 # standard deviations [N] of a contact force across and along the normal, before it is sensed
 ACROSS_STD = 0.5
@@ -70,7 +73,7 @@ def feel_torques(
     reference: ClosingReference,
     jacobian: Float[Tensor, "f 3 j"],
     torques: Float[Tensor, " j"],
-    period: Positive,
+    period: Annotated[float, Range(1e-06, 1.0)],
 ) -> TactileState:
     """Return the tactile state, readings and filters, of f fingertips whose forces are estimated
     from joint torques.
@@ -86,9 +89,11 @@ def feel_torques(
         torques: torques (j,) [N m, or N for a sliding joint] by which the joints press on the
             object. Each is positive in the direction of its joint. The caller must first subtract
             the torques of weight, friction and acceleration.
-        period: time [s] since the last readings.
+        period: time [s] since the last readings, 1e-6 to 1.
 
-    Raises `BadArgument` for a Jacobian with the shape of another hand.
+    Raises `BadArgument` for a Jacobian with the shape of another hand, and a period out of range.
+    Raises it for torques beyond ten times the hand's largest (`MOST_TORQUE`), which are in another
+    unit.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -103,6 +108,24 @@ def feel_torques(
     if jacobian.shape != shape:
         found = f"fingertips, 3 and joints {tuple(jacobian.shape)}"
         raise BadArgument("jacobian", found, f"those of the hand, {shape}")
+    largest = float(torques.abs().max())
+    effort = max(drive.effort for drive in reference.hand.actuators.values())
+    if largest > MOST_TORQUE * effort:
+        found = f"{largest:.3g}, where the strongest drive of the hand has {effort:g}"
+        raise BadArgument("torques", found, "torques in N m, or forces of sliding joints in N")
+    return _felt_by_torques(tactile, reference, jacobian, torques, period)
+
+
+def _felt_by_torques(
+    tactile: TactileState,
+    reference: ClosingReference,
+    jacobian: Float[Tensor, "f 3 j"],
+    torques: Float[Tensor, " j"],
+    period: float,
+) -> TactileState:
+    """Return the tactile state of f fingertips whose forces are estimated from the torques [N m] of
+    j joints; the arguments are those of `feel_torques`.
+    """
     forces_by = _forces_by_torques(reference, jacobian)
     radius = reference.hand.tips.radius
     forces = forces_by @ torques
@@ -216,7 +239,7 @@ class FingertipSensor:
             if self.generator is not None:
                 drawn = torch.randn(len(torques), generator=self.generator, dtype=torques.dtype)
                 torques = torques + self.model.noise * TORQUE_NOISE * drawn
-            self.sensed = feel_torques(before, reference, jacobian, torques, period)
+            self.sensed = _felt_by_torques(before, reference, jacobian, torques, period)
         else:
             radius = reference.hand.tips.radius
             noise = self.model.noise
@@ -229,15 +252,8 @@ class FingertipSensor:
             self.switched = torch.where(self.switched, stays, report.reading >= SWITCH_ON)
             report = feel_flags(report, self.switched)
         if not self.whole:
-            report = map_tensors(self._silence, report, no_contact(fingers=len(self.alive)))
+            report = silenced(report, self.alive)
         late = round(self.model.delay / max(period, 1 / SAMPLING_RATE))
         if self.sensed.reading is not before.reading:  # a sample is held until the next one
             self.reports = [*self.reports, report][-late - 1 :]
         return self.reports[0]
-
-    def _silence(self, sensed: Tensor, nothing: Tensor) -> Tensor:
-        """Return the readings `sensed` (f,) or (f, n), with those of `nothing` where a sensor is
-        dead.
-        """
-        alive = self.alive if sensed.ndim == 1 else self.alive[:, None]
-        return torch.where(alive, sensed, nothing)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.foundation.base import FINGERTIPS, Value, check_device
+from torchgrasp.foundation.base import FINGERTIPS, Value, check_device, map_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, Count, Range
@@ -138,6 +138,15 @@ def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -
     return TactileState(
         zero, vectors, zero > 0, nothing, nothing, lagged, zero, zero, 1 / SAMPLING_RATE
     )
+
+
+def silenced(tactile: TactileState, alive: Bool[Tensor, "f"]) -> TactileState:
+    """Return readings with those of `no_contact` where a sensor is not `alive` (f,)."""
+
+    def choose(sensed: Tensor, nothing: Tensor) -> Tensor:
+        return torch.where(alive if sensed.ndim == 1 else alive[:, None], sensed, nothing)
+
+    return map_tensors(choose, tactile, no_contact(fingers=len(alive)))
 
 
 @checked
@@ -281,6 +290,8 @@ class Observation(Value):
         tactile: readings of the fingertips.
         up: unit vector (3,) that points up. None means the table's normal of the plan: then the
             hand must not turn while it holds.
+        hand: name of the hand and its fingers, by which a controller recognises its own
+            (`describe_hand`). "" is not compared.
     """
 
     joints: Float[Tensor, " j"]
@@ -288,6 +299,7 @@ class Observation(Value):
     jacobian: Float[Tensor, "f 3 j"]
     tactile: TactileState
     up: Float[Tensor, "3"] | None = None
+    hand: str = ""
 
 
 @checked
@@ -307,7 +319,7 @@ def observe(
             arm turns the hand while it holds. None means the table's normal of the plan.
 
     Raises `BadArgument` for joints or fingertips on another device than the hand, or another number
-    of joints. Raises it for a joint that is far beyond its limits, too, as one in degrees.
+    of either. Raises it for a joint that is far beyond its limits, too, as one in degrees.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -315,12 +327,37 @@ def observe(
     torch.Size([3, 3, 8])
     """
     check_device("tactile", tactile.lagged.device, "the hand", hand.lower.device)
+    fingers = tactile.reading.shape[-1]
+    if fingers != len(hand.tips):
+        allowed = f"those of the fingers {', '.join(hand.finger_names)}, in this order"
+        raise BadArgument("tactile", f"readings of {fingers} fingertips", allowed)
     joints = joints.double()
     _check_places(hand, joints)
     tips = hand.tip_centres(joints)
     everything = hand.expand_joints(joints)
     up = None if up is None else up.double()
-    return Observation(everything, tips, joint_jacobian(hand, everything, tips), tactile, up)
+    jacobian = joint_jacobian(hand, everything, tips)
+    return Observation(everything, tips, jacobian, tactile, up, describe_hand(hand))
+
+
+def describe_hand(hand: Hand) -> str:
+    """Return the name of a hand and the names of its fingers, as one text."""
+    return f"{hand.name}: {', '.join(hand.finger_names)}"
+
+
+def check_observation(hand: Hand, observation: Observation) -> None:
+    """Raise `BadArgument` for an observation of another hand: one with other numbers of fingertips
+    or joints, or with another name.
+    """
+    counts = len(hand.tips), len(hand.tree.joint_names)
+    fingers = observation.tactile.reading.shape[-1]
+    shape = tuple(observation.jacobian.shape)
+    if (fingers, len(observation.joints)) != counts or shape != (counts[0], 3, counts[1]):
+        told = f"{fingers} readings, {len(observation.joints)} joints and a Jacobian {shape}"
+        allowed = f"those of the hand: {counts[0]} fingertips and {counts[1]} joints"
+        raise BadArgument("observation", told, allowed)
+    if observation.hand and observation.hand != describe_hand(hand):
+        raise BadArgument("observation", observation.hand, describe_hand(hand))
 
 
 def _check_places(hand: Hand, joints: Float[Tensor, " h"]) -> None:

@@ -368,7 +368,9 @@ class TrialRun:
         # The robot takes its pose for true.
         mesh.apply_transform(seen_from @ np.linalg.inv(scene_spec.world_from_hand))
         seed = seed_of(driver.trial.seed, "relook")
-        self.controller.relook(partial_view(mesh, camera, seed=seed))
+        # not `relook`: in a trial the object may have rolled too far away to be found
+        moved = self.controller.locate(partial_view(mesh, camera, seed=seed))
+        self.controller.follow(moved)
 
     @property
     def starts(self) -> bool:

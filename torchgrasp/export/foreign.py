@@ -252,7 +252,7 @@ def _read_own(
     fields: dict[str, Field], hand: Hand, unit_m: float, root: str | Pose
 ) -> ForeignGrasps:
     """Return the grasps of a file of `format_grasps`, given its fields."""
-    _check_own(fields)
+    _check_own(fields, unit_m)
     about = fields["hand"].entries() if "hand" in fields else {}
     if "name" in about and about["name"].text() != hand.name:
         raise about["name"].wrong(f"grasps of the {hand.name} hand, which is to read them")
@@ -288,9 +288,9 @@ def _read_own(
     return ForeignGrasps(joints["grasp"], placed, joints["pregrasp"], table)
 
 
-def _check_own(fields: dict[str, Field]) -> None:
+def _check_own(fields: dict[str, Field], unit_m: float) -> None:
     """Raise `ModelFileError` if a file says that it has another format, version or units than the
-    files of `format_grasps`.
+    files of `format_grasps`. Raise it for a `unit_m` that contradicts these units, too.
     """
     if "format" in fields and fields["format"].value != OWN_FORMAT:
         raise fields["format"].wrong(OWN_FORMAT)
@@ -300,6 +300,9 @@ def _check_own(fields: dict[str, Field]) -> None:
     for name, unit in CONVENTIONS["units"].items():
         if name in units and units[name].value != unit:
             raise units[name].wrong(unit)
+    if "length" in units and unit_m != 1.0:
+        found = f"positions in units of {unit_m:g} m, in a file that names metres"
+        raise units["length"].refuse(found, "the unit of the file, m")
 
 
 def _read_table(fields: dict[str, Field], rises: np.ndarray, unit_m: float) -> Plane | None:
@@ -571,8 +574,9 @@ def grasps_from_joints(
     torch.Size([1, 3, 3])
     """
     hand = hand.to("cpu", torch.float64)
-    joints = joints.double().cpu()
-    pose = obj_from_hand.double().cpu()
+    # copies: the caller may read the next grasp into the same memory
+    joints = joints.to("cpu", torch.float64, copy=True)
+    pose = obj_from_hand.to("cpu", torch.float64, copy=True)
     hand.check_joints(joints)
     pads, pad_normals = hand.fingertips(joints)
     normals = -rotate(pose, pad_normals)
@@ -582,7 +586,7 @@ def grasps_from_joints(
     if pregrasp is None:
         opened = _open(hand, joints, -pad_normals)
     else:
-        opened = hand.check_joints(pregrasp.double().cpu())
+        opened = hand.check_joints(pregrasp.to("cpu", torch.float64, copy=True))
     g, f = normals.shape[:2]
     zeros = torch.zeros(g, f, dtype=torch.float64)
     meta = {"hand": hand.name, "hand_sha256": hand.source.sha256, "units": "metre, radian"}

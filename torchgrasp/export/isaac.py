@@ -4,6 +4,8 @@ Facts: https://docs.isaacsim.omniverse.nvidia.com/latest/robot_simulation/grasp_
 https://nvidia-isaac-ros.github.io/concepts/manipulation/isaac_grasp.html.
 """
 
+import itertools
+import json
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -51,6 +53,7 @@ ROUNDING = 1e-6  # largest difference [m] of a flange from a link of its name
 DEEPEST = 8  # most levels of a file; the format has five
 OWN = "# grasps of the {} hand, by torchgrasp"  # the first line of our files
 OWN_HAND = re.compile(OWN.format("(.+)"))
+RENAMED = "# joints of the URDF, and their names here: "  # a line of our files with other names
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")  # YAML 1.1 takes 1e-05 for a text
 
 
@@ -150,6 +153,8 @@ def format_isaac(
         f"# confidence is the predicted success, 0 where it is unknown; {SQUEEZE} has the\n"
         f"# targets that press, a key of torchgrasp\n"
     )
+    if rename:
+        heading += f"{RENAMED}{json.dumps(dict(rename))}\n"
     return heading + yaml.safe_dump(
         content, default_flow_style=None, width=math.inf, sort_keys=False, allow_unicode=True
     )
@@ -221,6 +226,7 @@ def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -
         raise refuse(f"{path}: {PREGRASP} in some grasps only", "each grasp, or none")
     keys = {"grasp": GRASP, "pregrasp": PREGRASP} if True in opened else {"grasp": GRASP}
     taken: dict[str, list[dict[str, Field]]] = {what: [] for what in keys}
+    names = _read_names(path, data, hand, refuse)
     for row in rows.values():
         fields = row.entries("position", "orientation", *keys.values())
         if "confidence" in fields:
@@ -230,7 +236,7 @@ def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -
         xyz = turn["xyz"].numbers(3, -far, far)
         poses.append([*position, turn["w"].number(-far, far), *xyz])
         for what, key in keys.items():
-            taken[what].append(_check_joints(hand, fields[key]))
+            taken[what].append(_check_joints(hand, fields[key], names))
         skipped |= {*fields} - {*POSE_KEYS, *keys.values(), SQUEEZE}
     if skipped:
         warn_user(GraspFileWarning, f"{path.name}: not read: {', '.join(sorted(skipped))}")
@@ -246,13 +252,37 @@ def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -
     return IsaacFile("".join(frames[:1]), numbers, postures)
 
 
-def _check_joints(hand: Hand, field: Field) -> dict[str, Field]:
-    """Return the joints of a posture in a file by name; refuse unknown and missing ones."""
-    names = hand.tree.joint_names
-    if unknown := [x for x in field.entries() if x not in names]:
-        allowed = f"joints of the {hand.name} hand: {', '.join(names)}"
+def _read_names(path: Path, data: bytes, hand: Hand, refuse: Refuse) -> dict[str, str]:
+    """Return the name in the file of each joint of the hand. Our own files say which joints they
+    rename.
+    """
+    names = {joint: joint for joint in hand.tree.joint_names}
+    lines = data.decode("utf-8").splitlines()
+    for line in itertools.takewhile(lambda line: line.startswith("#"), lines):
+        if not line.startswith(RENAMED):
+            continue
+        try:
+            names |= json.loads(line.removeprefix(RENAMED))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise refuse(f"{path}: {line}", "an object of names in this line") from error
+    texts = all(isinstance(name, str) for name in names.values())
+    if not texts or len(names) > len(hand.tree.joint_names):
+        raise refuse(f"{path}: names of other joints", "names of the hand's joints")
+    if len(set(names.values())) < len(names):
+        raise refuse(f"{path}: one name for two joints", "a name for each joint")
+    return names
+
+
+def _check_joints(hand: Hand, field: Field, names: dict[str, str]) -> dict[str, Field]:
+    """Return the joints of a posture in a file, by their names in the hand; refuse unknown and
+    missing ones. `names` holds the name in the file of each joint.
+    """
+    ours = {name: joint for joint, name in names.items()}
+    if unknown := [x for x in field.entries() if x not in ours]:
+        allowed = f"joints of the {hand.name} hand: {', '.join(ours)}"
         raise field.refuse(f"{field.path}: {field.place} with {unknown[0]!r}", allowed)
-    return field.entries(*hand.joint_names)
+    found = field.entries(*(names[joint] for joint in hand.joint_names))
+    return {ours[name]: x for name, x in found.items()}
 
 
 def _fill(hand: Hand, rows: list[dict[str, Field]], far: float) -> dict[str, np.ndarray]:

@@ -18,7 +18,7 @@ from torchgrasp.cloud.read import read_cloud
 from torchgrasp.evaluation.touch import TOUCH, Touch, measure_touch
 from torchgrasp.export.foreign import POSE_NUMBERS, Quaternion, read_poses
 from torchgrasp.files import format_columns, format_json, write_file
-from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.hand import Hand
@@ -154,7 +154,10 @@ class Import(Command):
         for unit, quaternion in itertools.product(get_args(Unit), get_args(Quaternion)):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # the first reading told them
-                other = self._read(hand, quaternion, unit)
+                try:
+                    other = self._read(hand, quaternion, unit)
+                except ModelFileError:
+                    continue  # the file names another unit
             if _contradiction(other, surface) is None:
                 mend = f"{error.allowed}, as with --quaternion {quaternion} --unit {unit}"
                 raise BadArgument("FILE", error.found, mend)
