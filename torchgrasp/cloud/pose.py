@@ -239,13 +239,14 @@ def _describe_fault(pose: Transform) -> str:
 
 
 def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
-    """Return the given pose obj_from_camera (4, 4) [m] of a camera in float64, after checks.
+    """Return a copy of the pose obj_from_camera (4, 4) [m] of a camera in float64, after checks.
 
     A rotation within 0.1 degrees of a rigid one is replaced by it, and `MendedInput` warns. Raises
     `BadArgument` for another pose that is not rigid, or more than 100 m from the origin.
     """
     try:
-        read = torch.as_tensor(pose, dtype=torch.float64)
+        # a copy: programs change one array for the pose of each image
+        read = torch.as_tensor(pose, dtype=torch.float64).clone()
     except (TypeError, ValueError) as error:
         found = repr(pose)[:SHOWN_LETTERS]
         raise BadArgument("camera_pose", found, "a 4 x 4 matrix of numbers") from error

@@ -192,7 +192,9 @@ def read_cloud_file(
     none.ply, which is no file
     """
     try:
-        position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
+        position = None
+        if viewpoint is not None:
+            position = torch.as_tensor(viewpoint, dtype=torch.float64).clone()
     except (TypeError, ValueError, RuntimeError) as error:
         raise BadArgument("viewpoint", repr(viewpoint), "three numbers [m]") from error
     if position is not None:
