@@ -572,6 +572,31 @@ def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -
     return (f"{found}: if it was not so high, {metres}",) * high
 
 
+def tell_large(points: Points, pose: Transform, plane: Plane | None) -> tuple[str, ...]:
+    """Return one note, a sentence, if an object is larger than 0.2 m (`SIZES.large`) and its camera
+    is far away, else none.
+
+    Counts of a quarter of a millimetre, read as millimetres, give such a view. `points` (n, 3) [m]
+    are those of the object. `plane` is the table in their frame, None if none is found. The `pose`
+    (4, 4) [m] leads from the camera's frame to theirs.
+    """
+    ends = torch.tensor([SIZES.ends, 1 - SIZES.ends], dtype=torch.float64)
+    low, high = points.double().quantile(ends.to(points.device), 0)
+    size = float((high - low).max())
+    if size <= SIZES.large:
+        return ()
+    if plane is None:
+        middle = float(((points - pose[:3, 3]) @ pose[:3, 2]).median())
+        found = f"an object of {size:.2g} m, {middle:.3g} m away"
+        far = middle > SIZES.higher
+    else:
+        height = float(plane.height(pose[:3, 3]))
+        found = f"an object of {size:.2g} m, and a camera {height:.3g} m above its table"
+        far = height > SIZES.high
+    fix = "if both are too large, depth_unit (--depth-unit) says the metres of a count"
+    return (f"depth: {found}: {fix}",) * far
+
+
 def tell_furniture(points: Points, labels: Tensor) -> tuple[str, ...]:
     """Return one note, a sentence, if an object is at least 0.6 m long (`SIZES.furniture`), else
     none.
