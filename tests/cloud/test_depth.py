@@ -578,3 +578,15 @@ def test_pixels_that_are_not_square_are_told(ratio):
     with pytest.warns(CloudWarning, match=rf"fx is {ratio:g} times fy, .* resized unevenly"):
         cloud_from_depth(depth, (ratio * 70.0, 70.0, 39.5, 29.5))
     cloud_from_depth(depth, (1.02 * 70.0, 70.0, 39.5, 29.5))
+
+
+@pytest.mark.parametrize("kind", [torch.clone, np.array])
+def test_a_pose_and_intrinsics_that_change_later_do_not_change_what_was_read(kind):
+    pose = kind(torch.eye(4).double())
+    matrix = kind(K)
+    cloud = cloud_from_depth(tilted_depth(), matrix, camera_pose=pose)
+    scene_matrix = read_depth(tilted_depth(), matrix)[1]
+    pose[0, 3] = 0.4
+    matrix[0, 0] = 300.0
+    assert cloud.viewpoint.tolist() == [0, 0, 0]
+    assert torch.equal(scene_matrix, K)

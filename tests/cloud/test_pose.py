@@ -14,7 +14,13 @@ from tests.make import HALF, box, halved
 from torchgrasp import Scene, read_scene, save_scene
 from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.cloud.pose import read_camera_pose, read_pose, tell_furniture, tell_inverse
+from torchgrasp.cloud.pose import (
+    read_camera_pose,
+    read_pose,
+    tell_furniture,
+    tell_inverse,
+    tell_large,
+)
 from torchgrasp.cloud.prepare import merge_clouds
 from torchgrasp.foundation.errors import BadArgument, CloudWarning, MendedInput, NoSupport
 from torchgrasp.foundation.rules import is_rigid
@@ -90,8 +96,8 @@ def test_a_wrong_pose_is_told_by_what_contradicts_it(name, view):
 
 @functools.cache
 def masked():
-    """A mask of the near pixels, and their cloud by the right pose."""
-    near = (seen()[0] > 0) & (seen()[0] < 0.62)
+    """A mask of the objects' near pixels, and their cloud by the right pose."""
+    near = (right().pixel_labels > 0) & (seen()[0] < 0.62)
     return near, cloud_from_depth(seen()[0], HALF, near, seen()[1])
 
 
@@ -458,3 +464,28 @@ def test_a_camera_far_from_its_origin_is_told_where_no_table_is_seen():
     far = rigid(pose[:3, :3], torch.tensor([40.0, 0.0, 50.0]).double())
     with pytest.warns(CloudWarning, match="divide camera_pose.* by 100"):
         cloud_from_depth(near, HALF, camera_pose=far)
+
+
+def test_counts_of_another_unit_are_told_for_the_cloud_of_a_mask():
+    depth, _ = seen()
+    # in the camera's frame, where no height of a table is expected
+    mask = right().pixel_labels == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cloud_from_depth(depth, HALF, mask)
+    counts = (depth / 0.00025).round().to(torch.int32)
+    with pytest.warns(CloudWarning, match=r"a camera 1.98 m above its table: .* depth_unit"):
+        large = cloud_from_depth(counts, HALF, mask)
+    given = cloud_from_depth(counts, HALF, mask, depth_unit=0.00025)
+    torch.testing.assert_close(large.points, 4 * given.points)
+
+
+def test_a_large_object_is_told_under_a_far_camera_alone():
+    draw = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)).double()
+    table = Plane.horizontal(0.0)
+    for size, high, told in ((0.3, 2.0, 1), (0.3, 0.9, 0), (0.15, 2.0, 0)):
+        pose = look_at(0.0, 89.0, high)
+        assert len(tell_large(size * draw, pose, table)) == told
+    # without a table in view the distance of the object counts
+    assert "2 m away" in tell_large(0.3 * draw, look_at(0.0, 0.0, 2.15), None)[0]
+    assert not tell_large(0.3 * draw, look_at(0.0, 0.0, 1.2), None)

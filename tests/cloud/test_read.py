@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.depth import cloud_from_depth
@@ -16,11 +17,13 @@ from torchgrasp.files.columns import read_lines
 from torchgrasp.foundation.errors import (
     BadArgument,
     CloudFileError,
+    CloudWarning,
     GraspError,
     OutputError,
     SuspiciousScale,
     TooFewPoints,
 )
+from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
 
@@ -155,6 +158,52 @@ def test_the_default_viewpoint_of_pcd_counts_only_where_a_camera_can_have_been_t
     assert (file.cloud.viewpoint is not None) == believed
     assert believed != any("default viewpoint" in note for note in file.notes)
     assert read_cloud(tmp_path / "a.pcd", viewpoint=[0.0, 0.0, 0.0]).viewpoint.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("place", "count"), [((30.0, 40.0), 10**6), ((200.0, 35.0), 600), ((110.0, 70.0), 10**6)]
+)
+def test_points_in_the_frame_of_a_camera_whose_pose_is_the_viewpoint_are_told(
+    tmp_path, place, count
+):
+    body = trimesh.creation.icosphere(2, 0.025).apply_translation([0.5, 0.0, 0.8])
+    pose = look_at(*place, 0.6, body)
+    # every pixel, or some
+    seen = partial_view(body, pose, count, noise=False).points
+    own = apply(inverse(pose), seen)
+    turned = pose[:3, :3].numpy()
+    forward = turned @ np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x forward, z up
+    for points, axes, told in (
+        (own, turned, True),
+        (own, np.eye(3), count > 600),
+        (seen, turned, False),
+        (seen, forward, False),
+    ):
+        x, y, z, w = Rotation.from_matrix(axes).as_quat()
+        view = " ".join(f"{number:.9f}" for number in [*pose[:3, 3].tolist(), w, x, y, z])
+        (tmp_path / "a.pcd").write_bytes(pcd(points.numpy(), view))
+        file = read_cloud_file(tmp_path / "a.pcd")
+        assert bool(file.doubts) == told and file.doubts == file.notes
+        said = pytest.warns(CloudWarning, match="VIEWPOINT is elsewhere.*--camera-pose")
+        with said if told else contextlib.nullcontext():
+            assert file.tell("a.pcd") is file.cloud
+
+
+def test_an_estimated_surface_and_a_header_with_a_scale_are_told(tmp_path):
+    ball = trimesh.creation.icosphere(2, 0.05)
+    ball.export(tmp_path / "a.ply")
+    assert not read_cloud_file(tmp_path / "a.ply").notes
+    ball.vertex_attributes["std_m"] = np.full(len(ball.vertices), 0.002, dtype=np.float32)
+    ball.export(tmp_path / "a.ply")
+    with pytest.warns(CloudWarning, match="an estimated surface, whose std_m are not read"):
+        read_cloud(tmp_path / "a.ply")
+    text = b"ply\nformat ascii 1.0\ncomment scale 0.5\nelement vertex 60\n"
+    text += b"".join(b"property float %c\n" % letter for letter in b"xyz") + b"end_header\n"
+    (tmp_path / "a.ply").write_bytes(
+        text + b"".join(b"%f %f %f\n" % tuple(p) for p in unit_rows(60))
+    )
+    with pytest.warns(CloudWarning, match="'comment scale 0.5' is not applied"):
+        read_cloud(tmp_path / "a.ply")
 
 
 def test_the_base_of_a_robot_below_all_points_is_no_camera(tmp_path):

@@ -18,7 +18,8 @@ from torchgrasp.cloud import save_cloud
 from torchgrasp.cloud.neighbours import fit_local_planes
 from torchgrasp.data import load_shipped_grasp
 from torchgrasp.data.accept import as_cloud, as_hand, as_seen
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoEffect
+from torchgrasp.geometry.plane import Plane
 
 VIEW = load_object("cylinder").view
 ARRAY = VIEW.points.numpy()
@@ -45,6 +46,12 @@ def test_what_holds_points_is_a_cloud_of_these_points_in_metres_without_a_camera
     cloud = as_cloud(given, "cloud")
     assert torch.allclose(cloud.points.double(), VIEW.points.double(), atol=1e-7)
     assert cloud.normals is None and cloud.viewpoint is None
+
+
+def test_the_table_of_a_file_is_told_where_it_is_not_read(tmp_path):
+    path = save_cloud(VIEW, tmp_path / "a.npz", Plane.horizontal(0.02))
+    with pytest.warns(NoEffect, match="holds a table, normal 0 0 1, offset 0.02.* give it"):
+        assert torch.equal(as_cloud(path, "cloud").points, VIEW.points)
 
 
 def test_normals_of_open3d_and_of_six_columns_are_kept():

@@ -14,6 +14,7 @@ from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.creases import cut_creases
+from torchgrasp.scene.image import read_image
 from torchgrasp.values.planning import PointCloud
 
 POSE = look_at(20.0, 45.0, 0.6)
@@ -44,6 +45,21 @@ def picture():
 @pytest.fixture(scope="module")
 def scene(picture):
     return Scene.from_depth(picture[0], K, POSE)
+
+
+@pytest.mark.parametrize("kind", [torch.clone, np.array])
+def test_a_pose_that_moves_on_leaves_the_scenes_before_in_their_place(picture, kind):
+    depth = picture[0]
+    moving = kind(POSE)
+    image = read_image(depth, K, moving)
+    moving[:3, 3] += 0.5
+    assert torch.equal(image.obj_from_camera, POSE)
+
+
+def test_arrays_that_are_read_backwards_are_taken_as_they_are(picture, scene):
+    # (row, column), as NumPy counts, reversed to a pixel
+    place = np.array(middle(picture[1], 2)[::-1])
+    assert scene.select(place[::-1]).target == scene.select(middle(picture[1], 2)).target
 
 
 def middle(labels, k):

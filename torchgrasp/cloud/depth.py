@@ -18,9 +18,17 @@ from torchgrasp.cloud.intrinsics import (
     parse_intrinsics,
 )
 from torchgrasp.cloud.lens import Lens, describe
-from torchgrasp.cloud.pose import check_view, read_camera_pose, tell_far, tell_inverse, tell_tilt
+from torchgrasp.cloud.pose import (
+    check_view,
+    read_camera_pose,
+    tell_far,
+    tell_inverse,
+    tell_large,
+    tell_tilt,
+)
 from torchgrasp.cloud.rays import tell_rays
 from torchgrasp.cloud.sensor import Image
+from torchgrasp.cloud.surroundings import tell_strip
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, CloudWarning, MendedInput, TooFewPoints
 from torchgrasp.foundation.rules import Positive
@@ -117,7 +125,8 @@ def cloud_from_depth(
     ray is undistorted. `MendedInput` then warns that the distortion was removed. A `CloudWarning`
     is given for a camera more than 10 m from the origin. It is also given for depths in steps of 5
     mm or more, and for depths scaled to 0..1. Masks with several numbers and pixels far from square
-    raise it, too.
+    raise it, too. So do a mask with a strip of the table, and a large object under a high camera,
+    whose unit may be another.
 
     Raises:
         BadArgument: depth that is negative or of another unit.
@@ -157,6 +166,9 @@ def cloud_from_depth(
         support = check_view(view, pose.cpu(), up, depth_unit is not None, target)
         if support is not None and up is None:
             notes += tell_tilt(pose.cpu(), support.plane)
+        plane = None if support is None else support.plane.to(dtype=own.dtype)
+        notes += () if plane is None else tell_strip(own, plane)
+        notes += () if depth_unit is not None else tell_large(own, pose.cpu(), plane)
         # an image that a lens bends shows no plane, and one of the object alone no table
         around = lens is None and count < DEPTH.whole * int(seen.sum())
         if around and (support is None or support.local or notes):

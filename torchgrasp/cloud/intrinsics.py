@@ -152,7 +152,8 @@ def parse_intrinsics(
     table, size, scale, window, lens = _read_written(value)
     k = as_tensor("intrinsics", table)
     allowed = "(fx, fy, cx, cy), or a 3 x 3 matrix"
-    k = k if k.is_complex() else k.double()
+    # a copy: programs scale one matrix for images of several sizes
+    k = k if k.is_complex() else k.to(torch.float64, copy=True)
     if k.ndim == 1 and len(k) in (3 * 3, 3 * 4):
         k = k.reshape(3, -1)
     if k.shape in ((4,), (6,)):

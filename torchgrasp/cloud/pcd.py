@@ -21,9 +21,9 @@ DEFAULT = [0, 0, 0, 1, 0, 0, 0]
 def parse_pcd(data: bytes) -> dict[str, Any]:
     """Return the arrays of a PCD file by name, in the file's unit.
 
-    They are "points" and "normals" (n, 3) and "viewpoint" (3,), None if missing. "default" is
-    whether VIEWPOINT is `0 0 0 1 0 0 0`, which many writers fill in, wherever the camera was.
-    Raises `Malformed` for a malformed file.
+    They are "points" and "normals" (n, 3) and "viewpoint" (3,), None if missing. "turn" (4,) is the
+    quaternion wxyz of VIEWPOINT. "default" is whether VIEWPOINT is `0 0 0 1 0 0 0`, which many
+    writers fill in, wherever the camera was. Raises `Malformed` for a malformed file.
     """
     header, body = _split_header(data)
     if missing := [word for word in ("FIELDS", "SIZE", "TYPE") if word not in header]:
@@ -58,7 +58,7 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
     if len(viewpoint) != 7:
         raise Malformed(f"VIEWPOINT with {len(viewpoint)} numbers, not 7")
     default = np.array_equal(viewpoint, DEFAULT)
-    return {**found, "viewpoint": viewpoint[:3], "default": default}
+    return {**found, "viewpoint": viewpoint[:3], "turn": viewpoint[3:], "default": default}
 
 
 def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:

@@ -105,6 +105,18 @@ def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None
     return eye if least < PIXELS.regular else None
 
 
+def is_lattice(points: Points, eye: Vector) -> bool:
+    """Return whether points (n, 3) [m] form a regular lattice of pixels as seen from `eye` (3,) [m].
+
+    It is False for fewer than 100 points (`PIXELS.least`).
+    """
+    if len(points) < PIXELS.least:
+        return False
+    rows = draw_rows(len(points), PIXELS.probes)
+    near = points[nearest(points, PIXELS.neighbours + 1, rows)[1][:, 1:]]
+    return float(irregularity(points[rows], near, eye[None])) < PIXELS.regular
+
+
 def irregularity(
     probes: Float[Tensor, "m 3"], near: Float[Tensor, "m k 3"], eyes: Float[Tensor, "c 3"]
 ) -> Float[Tensor, "c"]:

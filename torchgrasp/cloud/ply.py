@@ -29,6 +29,7 @@ SHAPES = {"viewpoint": (3,), "frustum": (4, 3), "table": (4,)}
 """Shapes of the arrays in comments."""
 MEANT = ("scale", "scaling", "offset", "shift", "unit", "units")
 """First words of comments that may change what the coordinates mean; no standard has them."""
+DEVIATION = "std_m"  # the property of an estimated surface, which `save_surface` writes
 SAMPLED = 2000  # points on the surface of a mesh
 ROUNDING = 1e-5  # greatest rounding [m] of coordinates that are written in float32
 Property = tuple[str, str, str]  # name, type, and type of the length if it is a list
@@ -39,7 +40,8 @@ def parse_ply(data: bytes) -> dict[str, Any]:
 
     They are "points" and "normals" (n, 3), "viewpoint" (3,), "frustum" (4, 3) and "table" (4,),
     where the file has them. "said" lists comments on a unit or a scale, which are not applied. A
-    mesh gives points on its surface. Raises `Malformed` for a malformed file.
+    mesh gives points on its surface. "estimated" is whether it has standard deviations (`std_m`).
+    Raises `Malformed` for a malformed file.
     """
     header, body = _split_header(data)
     encoding = ""
@@ -79,11 +81,13 @@ def parse_ply(data: bytes) -> dict[str, Any]:
             found = f"a mesh of {len(body)} bytes of text"
             raise Malformed(f"{found}, which may have {TEXT_MESH_BYTES}")
         points, normals = _sample_mesh(data)
+        estimated = any(name == DEVIATION for _, _, of in elements for name, _, _ in of)
         return {
             "points": points,
             "normals": normals,
             "viewpoint": known.get("viewpoint"),
             "said": said,
+            "estimated": estimated,
         }
     if not elements or elements[0][0] != "vertex":
         raise Malformed("a first element that is not called vertex")

@@ -239,13 +239,14 @@ def _describe_fault(pose: Transform) -> str:
 
 
 def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
-    """Return the given pose obj_from_camera (4, 4) [m] of a camera in float64, after checks.
+    """Return a copy of the pose obj_from_camera (4, 4) [m] of a camera in float64, after checks.
 
     A rotation within 0.1 degrees of a rigid one is replaced by it, and `MendedInput` warns. Raises
     `BadArgument` for another pose that is not rigid, or more than 100 m from the origin.
     """
     try:
-        read = torch.as_tensor(pose, dtype=torch.float64)
+        # a copy: programs change one array for the pose of each image
+        read = torch.as_tensor(pose, dtype=torch.float64).clone()
     except (TypeError, ValueError) as error:
         found = repr(pose)[:SHOWN_LETTERS]
         raise BadArgument("camera_pose", found, "a 4 x 4 matrix of numbers") from error
@@ -569,6 +570,31 @@ def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -
         found = f"{found}, and objects of {1e3 * sizes[0]:.0f} to {1e3 * sizes[-1]:.0f} mm"
         return (f"{found}: if they are larger, {metres}",)
     return (f"{found}: if it was not so high, {metres}",) * high
+
+
+def tell_large(points: Points, pose: Transform, plane: Plane | None) -> tuple[str, ...]:
+    """Return one note, a sentence, if an object is larger than 0.2 m (`SIZES.large`) and its camera
+    is far away, else none.
+
+    Counts of a quarter of a millimetre, read as millimetres, give such a view. `points` (n, 3) [m]
+    are those of the object. `plane` is the table in their frame, None if none is found. The `pose`
+    (4, 4) [m] leads from the camera's frame to theirs.
+    """
+    ends = torch.tensor([SIZES.ends, 1 - SIZES.ends], dtype=torch.float64)
+    low, high = points.double().quantile(ends.to(points.device), 0)
+    size = float((high - low).max())
+    if size <= SIZES.large:
+        return ()
+    if plane is None:
+        middle = float(((points - pose[:3, 3]) @ pose[:3, 2]).median())
+        found = f"an object of {size:.2g} m, {middle:.3g} m away"
+        far = middle > SIZES.higher
+    else:
+        height = float(plane.height(pose[:3, 3]))
+        found = f"an object of {size:.2g} m, and a camera {height:.3g} m above its table"
+        far = height > SIZES.high
+    fix = "if both are too large, depth_unit (--depth-unit) says the metres of a count"
+    return (f"depth: {found}: {fix}",) * far
 
 
 def tell_furniture(points: Points, labels: Tensor) -> tuple[str, ...]:

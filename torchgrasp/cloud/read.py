@@ -9,21 +9,31 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
 from torchgrasp.cloud.neighbours import NEAR, draw_rows, find_inliers, fit_local_planes
 from torchgrasp.cloud.pcd import parse_pcd
+from torchgrasp.cloud.pixels import is_lattice
 from torchgrasp.cloud.ply import format_ply, parse_ply
 from torchgrasp.cloud.safe_files import parse_npy, parse_npz, unread_arrays
-from torchgrasp.cloud.viewpoint import can_see, is_along_z
+from torchgrasp.cloud.viewpoint import GUESS, can_see, is_along_z, is_before_origin
 from torchgrasp.files import explain, read_bounded, write_file
 from torchgrasp.files.columns import find_columns, parse_text
 from torchgrasp.foundation.base import Value, flatnonzero, named_tensors
 from torchgrasp.foundation.checks import check_tensor, checked
-from torchgrasp.foundation.errors import BadArgument, CloudFileError, TooFewPoints
+from torchgrasp.foundation.errors import (
+    BadArgument,
+    CloudFileError,
+    CloudWarning,
+    TooFewPoints,
+)
 from torchgrasp.foundation.limits import CLOUD_BYTES, CLOUD_POINTS
 from torchgrasp.foundation.rules import check_unmasked
+from torchgrasp.foundation.told import warn_user
+from torchgrasp.geometry.frames import rotation_from_vector
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.linalg import unit as unit_vectors
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
@@ -93,6 +103,8 @@ class CloudFile(Value):
         notes: a sentence for each kind of data in the file that was left out.
         table: plane of the table in the frame of the cloud, as `save_cloud` writes it. None if the
             file holds none.
+        doubts: those of the notes that say that the points may mean something else. `read_cloud`
+            warns of them.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp(), "cloud.npy")
@@ -105,6 +117,13 @@ class CloudFile(Value):
     cloud: PointCloud
     notes: tuple[str, ...]
     table: Plane | None = None
+    doubts: tuple[str, ...] = ()
+
+    def tell(self, name: str) -> PointCloud:
+        """Return the cloud. Warn (`CloudWarning`) of the doubts; `name` is that of the file."""
+        for doubt in self.doubts:
+            warn_user(CloudWarning, f"{name}: {doubt}")
+        return self.cloud
 
 
 @checked
@@ -139,6 +158,10 @@ def read_cloud(
     normal is NaN or zero are left out. If most normals are NaN or zero, all normals are left out
     instead.
 
+    A `CloudWarning` is given for a header with a unit or a scale, which is not applied. It is also
+    given for an estimated surface, and for points of a `.pcd` that are perhaps in the camera's
+    frame.
+
     Args:
         path: the file.
         viewpoint: the camera's position (3,) [m] in the cloud's frame. It replaces the file's
@@ -158,7 +181,7 @@ def read_cloud(
     torchgrasp.foundation.errors.CloudFileError: path: expected a file ending in
     .ply, ..., got scan.docx
     """
-    return check_cloud(read_cloud_file(path, viewpoint, unit).cloud)
+    return check_cloud(read_cloud_file(path, viewpoint, unit).tell(str(path)))
 
 
 @checked
@@ -192,7 +215,9 @@ def read_cloud_file(
     none.ply, which is no file
     """
     try:
-        position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
+        position = None
+        if viewpoint is not None:
+            position = torch.as_tensor(viewpoint, dtype=torch.float64).clone()
     except (TypeError, ValueError, RuntimeError) as error:
         raise BadArgument("viewpoint", repr(viewpoint), "three numbers [m]") from error
     if position is not None:
@@ -317,14 +342,19 @@ def make_cloud(
         notes.append(f"columns {', '.join(arrays['other'])[: READ.shown]} were left out")
     if arrays.get("unread"):
         notes.append(f"arrays {', '.join(arrays['unread'])[: READ.shown]} were not read")
+    doubts = list[str]()
     for line in arrays.get("said", ())[: READ.lines]:
         told = f"the header's line {line[: READ.shown]!r} is not applied"
-        notes.append(f"{told}: --unit says the unit, and options are in metres")
+        doubts.append(f"{told}: --unit says the unit, and options are in metres")
+    if arrays.get("estimated"):
+        told = "an estimated surface, whose std_m are not read"
+        doubts.append(f"{told}: all of it counts as measured; plan on the cloud that it came from")
     points = scale * _as_rows(source, "points", arrays["points"])
     normals = arrays.get("normals")
     normals = None if normals is None else _as_rows(source, "normals", normals)
     # Frustum and default are those of the arrays' own camera.
     default = bool(arrays.get("default")) and viewpoint is None
+    viewpoint_of_file = viewpoint is None
     frustum = arrays.get("frustum") if viewpoint is None else None
     error = arrays.get("pose_error")
     if viewpoint is None and arrays.get("viewpoint") is not None:
@@ -354,6 +384,8 @@ def make_cloud(
     cloud = PointCloud(points[keep], normals, viewpoint, frustum, error)
     if default:
         cloud = _judge_default(cloud, notes)
+    elif arrays.get("turn") is not None and viewpoint_of_file:
+        doubts += _tell_own_frame(cloud, torch.from_numpy(arrays["turn"]))
     table = arrays.get("table")
     if table is not None:
         *normal, offset = _as_numbers(source, "table", table, (4,)).tolist()
@@ -361,7 +393,7 @@ def make_cloud(
             found = f"{source}: a table with the normal {normal}"
             raise CloudFileError("path", found, "a unit vector")
         table = Plane(torch.tensor(normal, dtype=torch.float64), scale * offset)
-    return CloudFile(cloud, tuple(notes), table)
+    return CloudFile(cloud, (*notes, *doubts), table, tuple(doubts))
 
 
 def _as_numbers(source: str, name: str, array: Any, *shapes: tuple[int, ...]) -> Tensor:
@@ -494,6 +526,33 @@ def _find_repeated(points: Tensor, keep: Tensor, notes: list[str]) -> Tensor:
     missing = f"rows at exactly ({where}), missing pixels, were left out"
     notes.append(f"{int(found.sum())} of {len(points)} {missing}")
     return found
+
+
+def _tell_own_frame(cloud: PointCloud, turn: Float[Tensor, "4"]) -> list[str]:
+    """Return a list with one sentence if points of a PCD file are perhaps in their camera's frame;
+    else an empty one.
+
+    `turn` is the quaternion wxyz of the camera in the frame of VIEWPOINT. Seen from the camera, the
+    points are ahead, along z as in images, or along x as on robots. If they are not, but lie before
+    the origin, the origin may be the camera. So it may if its pixels alone are a regular lattice.
+    PCL writes such files.
+    """
+    points = cloud.points
+    eye = cloud.viewpoint
+    if eye is None or not is_before_origin(points):
+        return []
+    half = norm(turn[1:])
+    past = False
+    # a camera that is not turned has no direction that anybody gave
+    if float(half) > 0:
+        axes = rotation_from_vector(2 * torch.atan2(half, turn[0]) * turn[1:] / half)
+        ahead = unit_vectors(points.mean(0) - eye) @ axes
+        past = max(float(ahead[0]), float(ahead[2])) < GUESS.ahead
+    own = is_lattice(points, torch.zeros_like(eye)) and not is_lattice(points, eye)
+    if not past and not own:
+        return []
+    found = "the points lie before the origin, as in a camera's frame, and VIEWPOINT is elsewhere"
+    return [f"{found}: if VIEWPOINT is the camera's pose, give it as --camera-pose"]
 
 
 def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:

@@ -28,6 +28,12 @@ class SurroundingNumbers:
     """
     share: float = 0.1
     """Least share of all points that are on the table and so far from the outline."""
+    beside: float = 0.01
+    """Distance [m] from the outline beyond which points of a mask on the table are told. Borders of
+    masks err by less.
+    """
+    strip: float = 0.05
+    """Least share of all points of the mask that are on the table and so far from the outline."""
     sectors: int = 12
     """Number of equal sectors around the object, seen from above."""
     sides: float = 0.55
@@ -58,22 +64,43 @@ def find_surroundings(points: Points, normals: Points, table: Plane | None) -> f
     return _share_around_some(points, normals.double().cpu())
 
 
-def _share_around(points: Points, table: Plane) -> float:
-    """Return the share of points (n, 3) [m] on a table around an object; 0 if they do not surround
-    it.
+def tell_strip(points: Points, table: Plane) -> tuple[str, ...]:
+    """Return one note, a sentence, if 5 % (`SURROUNDINGS.strip`) of the points of a mask lie on the
+    table beside the object, else none.
+
+    A mask from a colour image that is not aligned with the depth has such points. `points` (n, 3)
+    [m] and the `table` are in one frame.
+    """
+    share = len(_beside(points, table, SURROUNDINGS.beside)) / len(points)
+    if share < SURROUNDINGS.strip:
+        return ()
+    found = f"mask: {share:.0%} of its points lie on the table beside the object"
+    return (f"{found}: unless they are a thin part of it, align the mask with the depth image",)
+
+
+def _beside(points: Points, table: Plane, least: float) -> Float[Tensor, "k 2"]:
+    """Return where points (n, 3) [m] on a table lie that are farther than `least` [m] from the
+    object's outline. The places [m] are in the table's plane, seen from the middle of the object.
     """
     height = table.height(points)
     on = points[height.abs() < SURROUNDINGS.layer]
     risen = points[height > SURROUNDINGS.risen]
     if min(len(on), len(risen)) < SURROUNDINGS.fewest:
-        return 0.0
+        return points.new_zeros(0, 2)
     axes = torch.stack(across(table.normal.to(points)), -1)  # (3, 2)
     # seen from above: the convex outline of the object
     outline = spatial.ConvexHull((risen @ axes).numpy(), qhull_options="QJ")
     sides = torch.from_numpy(outline.equations).to(points)  # (k, 3)
     flat = on @ axes
     outside = (flat @ sides[:, :2].T + sides[:, 2]).amax(1)
-    far = flat[outside > SURROUNDINGS.beyond] - (risen @ axes).mean(0)
+    return flat[outside > least] - (risen @ axes).mean(0)
+
+
+def _share_around(points: Points, table: Plane) -> float:
+    """Return the share of points (n, 3) [m] on a table around an object; 0 if they do not surround
+    it.
+    """
+    far = _beside(points, table, SURROUNDINGS.beyond)
     share = len(far) / len(points)
     turn = torch.atan2(far[:, 1], far[:, 0]) / (2 * torch.pi) + 0.5
     sector = (turn * SURROUNDINGS.sectors).long().clamp_max(SURROUNDINGS.sectors - 1)

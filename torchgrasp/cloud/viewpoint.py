@@ -152,6 +152,14 @@ def is_along_z(points: Points) -> bool:
     return float(middle[2]) > GUESS.ahead * float(norm(middle))
 
 
+def is_before_origin(points: Points) -> bool:
+    """Return whether all points (n, 3) lie before a camera in the origin that looks along z.
+
+    They lie within 50 degrees (`GUESS.half_view`) of z, and farther than twice their extent.
+    """
+    return _is_ahead(points, *_enclose(points))
+
+
 def _is_ahead(points: Points, centre: Vector, radius: Float[Tensor, ""]) -> bool:
     """Return whether points lie before a camera in the origin that looks along z."""
     least = math.cos(math.radians(GUESS.half_view))

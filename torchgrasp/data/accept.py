@@ -16,8 +16,9 @@ from torch import Tensor
 from torchgrasp.cloud.read import make_cloud, read_cloud_file
 from torchgrasp.data.shipped import GraspObject, find_view
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.foundation.rules import Taken, check_path, show
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand, hands_folder, load_hand
 from torchgrasp.scene.file import read_scene
@@ -70,15 +71,20 @@ def as_cloud(value: Any) -> PointCloud:
 
     The value may be a cloud, a `GraspObject`, a file, or an array or tensor (n, 3) [m]. It may also
     be a cloud of Open3D or trimesh. The name of a shipped object means its view. An array has no
-    viewpoint. `@_named` adds a second argument, the name that errors give to the value. Raises
-    `BadArgument` for anything else, and `CloudFileError` for a malformed file.
+    viewpoint. `@_named` adds a second argument, the name that errors give to the value. `NoEffect`
+    warns of a file's table, which is not part of the cloud. Raises `BadArgument` for anything else,
+    and `CloudFileError` for a malformed file.
     """
     if isinstance(value, PointCloud):
         return value
     if isinstance(value, GraspObject):
         return value.view
     if isinstance(value, str | Path):
-        return read_cloud_file(find_view(Path(value))).cloud
+        file = read_cloud_file(find_view(Path(value)))
+        if file.table is not None:
+            found = f"the file holds a table, {file.table.describe()}, which is not read with it"
+            warn_user(NoEffect, f"{value}: {found}; give it as the table")
+        return file.tell(str(value))
     if isinstance(value, Tensor):
         return PointCloud(value)
     if isinstance(value, np.ndarray):

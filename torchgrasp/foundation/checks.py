@@ -233,6 +233,8 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
     _, origin, inside, is_number, of_tensor, is_container = _form(hint)
     if isinstance(value, np.ndarray):
         check_unmasked(name, value)
+        # torch takes no array that is read backwards, such as a reversed pixel
+        value = value.copy() if min(value.strides, default=0) < 0 else value
     if of_tensor:
         return _read_tensor(name, value, hint, call)
     if origin is Annotated:

@@ -118,7 +118,9 @@ class ViewOptions:
                 notes += tell_inverse(pose) if self.up is None else ()
                 cloud = _move(name, cloud, pose)
                 table = table and table.moved(pose)
-                notes = tuple(note for note in notes if "default viewpoint" not in note)
+                # the pose tells where the camera is, whatever the file says
+                told = ("default viewpoint", "VIEWPOINT is elsewhere")
+                notes = tuple(note for note in notes if not any(said in note for said in told))
             if not whole:
                 check_cloud(cloud)
                 if len(cloud) > MOST_POINTS:
