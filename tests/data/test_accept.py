@@ -50,7 +50,7 @@ def test_what_holds_points_is_a_cloud_of_these_points_in_metres_without_a_camera
 
 def test_the_table_of_a_file_is_told_where_it_is_not_read(tmp_path):
     path = save_cloud(VIEW, tmp_path / "a.npz", Plane.horizontal(0.02))
-    with pytest.warns(NoEffect, match="holds a table, normal 0 0 1, offset 0.02.* give it"):
+    with pytest.warns(NoEffect, match="its table, normal 0 0 1, offset 0.02.* give it"):
         assert torch.equal(as_cloud(path, "cloud").points, VIEW.points)
 
 

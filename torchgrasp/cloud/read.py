@@ -353,11 +353,11 @@ def make_cloud(
     normals = arrays.get("normals")
     normals = None if normals is None else _as_rows(source, "normals", normals)
     # Frustum and default are those of the arrays' own camera.
-    default = bool(arrays.get("default")) and viewpoint is None
-    viewpoint_of_file = viewpoint is None
-    frustum = arrays.get("frustum") if viewpoint is None else None
+    of_file = viewpoint is None
+    default = bool(arrays.get("default")) and of_file
+    frustum = arrays.get("frustum") if of_file else None
     error = arrays.get("pose_error")
-    if viewpoint is None and arrays.get("viewpoint") is not None:
+    if of_file and arrays.get("viewpoint") is not None:
         viewpoint = scale * _as_rows(source, "viewpoint", arrays["viewpoint"])
         if not bool(torch.isfinite(viewpoint).all()):
             found = f"{source}: a viewpoint with NaN or infinity"
@@ -384,7 +384,7 @@ def make_cloud(
     cloud = PointCloud(points[keep], normals, viewpoint, frustum, error)
     if default:
         cloud = _judge_default(cloud, notes)
-    elif arrays.get("turn") is not None and viewpoint_of_file:
+    elif arrays.get("turn") is not None and of_file:
         doubts += _tell_own_frame(cloud, torch.from_numpy(arrays["turn"]))
     table = arrays.get("table")
     if table is not None:

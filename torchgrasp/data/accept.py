@@ -82,8 +82,8 @@ def as_cloud(value: Any) -> PointCloud:
     if isinstance(value, str | Path):
         file = read_cloud_file(find_view(Path(value)))
         if file.table is not None:
-            found = f"the file holds a table, {file.table.describe()}, which is not read with it"
-            warn_user(NoEffect, f"{value}: {found}; give it as the table")
+            found = f"its table, {file.table.describe()}, is not part of the cloud"
+            warn_user(NoEffect, f"{value}: {found}; give it as the table, unless you do")
         return file.tell(str(value))
     if isinstance(value, Tensor):
         return PointCloud(value)
