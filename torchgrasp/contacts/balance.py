@@ -327,8 +327,11 @@ def central_forces(
     `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals. All are in
     one frame. `preferred` are normal forces, which also fix the scale of the result. The forces may
     need a friction coefficient greater by `slack` than the least one. A larger `slack` gives forces
-    nearer to the preferred ones. The forces of a set are NaN if no balanced forces push at every
-    contact. The friction coefficient for this is at most 10 (`BALANCE.max_friction`).
+    nearer to the preferred ones.
+
+    The result acts on the object and pushes into it at every contact. It is NaN for a set where no
+    such forces are found. They are sought up to a friction coefficient of 10
+    (`BALANCE.max_friction`).
     """
     wrench = grasp_map(points / centre_and_radius(points)[1])
     null = torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:]

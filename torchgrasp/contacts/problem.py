@@ -276,12 +276,13 @@ class Constraints(Batch):
 def forces_from_tensions(
     points: Vectors, tension: Tensions
 ) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
-    """Return the forces (b, f, 3) on the object at the contacts, and the vector (b, p, 3) of each
-    pair.
+    """Return the forces (b, f, 3) on the object at f contacts, and the vector (b, p, 3) of each
+    pair of contacts.
 
-    The vector of a pair leads from its first to its second contact. The force on the first contact
-    of a pair is tension times vector, that on the second is opposite. `points` have the shape (b,
-    f, 3), and `tension` (b, p).
+    All p = f (f - 1) / 2 pairs count, in the order of `contact_pairs`. The vector of a pair leads
+    from its first to its second contact. The force on the first contact is tension times vector,
+    that on the second is opposite. Each contact gets the sum over its pairs. `points` have the
+    shape (b, f, 3), and `tension` (b, p).
     """
     first, second = contact_pairs(points.shape[1], points.device)
     sides = points[:, second] - points[:, first]

@@ -59,11 +59,12 @@ def read_order(hand: Hand, order: Sequence[str]) -> tuple[Column, ...]:
     """Return how each number of a posture in another program's file becomes a joint of the `hand`.
 
     `order` has a word for each number of the posture: JOINT, JOINT:FACTOR or JOINT:FACTOR:OFFSET.
-    JOINT is the joint's name in the hand's URDF, and OFFSET is in [rad], or [m] for a sliding
-    joint. A word that does not start with a joint of the hand names a number that is not read.
+    JOINT is the joint's name in the hand's URDF. The joint is FACTOR times the number, by default 1,
+    plus OFFSET, by default 0. OFFSET is in [rad], or [m] for a sliding joint. A word that does not
+    start with a joint of the hand names a number that is not read.
 
     Raises `BadArgument` for an actuated joint that is missing, or a name twice. Raises it also for
-    a factor that is no number or 0.
+    a FACTOR of 0, and for a FACTOR or OFFSET that is no finite number.
     """
     columns = list[Column]()
     for word in order:

@@ -102,11 +102,14 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
     """Return the function or dataclass `thing` with a check of its arguments against their
     annotations. A wrong argument raises `BadArgument`.
 
-    It is used as a decorator. Type, shape, dtype and range are checked, and that numbers are
-    finite. NumPy numbers become Python numbers. A class checks its fields when an object is made.
-    If an argument is a `Value`, its fields are checked again. In a method, a letter in a shape has
-    the same size as in the fields of the object. A `Value` without `__post_init__` that the library
-    makes from tensors is not checked.
+    It is used as a decorator, `@checked` or `@checked(gradients=True)`; for the latter `thing` is
+    None. Type, shape, dtype and range are checked, and that numbers are finite. NumPy numbers
+    become Python numbers. A class checks its fields when an object is made. If an argument is a
+    `Value`, its fields are checked again. In a method, a letter in a shape has the same size as in
+    the fields of the object.
+
+    Calls from within another checked function are not checked. Only a dataclass is, if it has a
+    `__post_init__` or no tensor among its fields.
 
     With `gradients` True, the function is differentiable. It then takes tensors that require a
     gradient, dual tensors and tensors inside a transform of torch.func. Other functions refuse

@@ -5,7 +5,9 @@ from torchgrasp.foundation.fused import inlined
 
 @inlined
 def dot(a, b):
-    """Return the dot product of the vectors `a` and `b` of 3 numbers."""
+    """Return the dot product, a number, of two vectors: tuples or rows of arrays, of 3 numbers
+    each.
+    """
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

@@ -61,8 +61,8 @@ class ResidualRows(NamedTuple):
     """k residuals of each of g hand configurations, and what their Jacobian is computed from.
 
     The hand has q motions: three translations, three rotations, and those of the moved joints. The
-    derivative of a residual by a motion is `wrench` times the twist of the motion
-    (`SpatialJacobian.twists`). It counts only where `moves` is 1.
+    derivative of a residual by a motion is `wrench` times the motion's twist
+    (`SpatialJacobian.twists`) times `moves`.
     """
 
     # weighted lengths [mm], or weighted errors of the cosines between pads and surface
@@ -70,7 +70,9 @@ class ResidualRows(NamedTuple):
     # derivatives of each residual by a translation [m] (3) and a rotation [rad] about the object's
     # origin (3)
     wrench: Float[Tensor, "g k 6"]
-    moves: Float[Tensor, "*g k q"]  # 1 where a motion changes a residual, else 0
+    # (g, k, q): 1 where a motion moves the link of a residual, else 0. For a residual between two
+    # links: that of the second link minus that of the first, so 1, 0 or -1.
+    moves: Float[Tensor, "*g k q"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,7 +129,9 @@ class SpatialJacobian(Value):
         Translation is along the axes of the hand's root link, and rotation about them.
 
         `wrench` holds the residuals' derivatives by a translation [m] and a rotation [rad] about
-        the object's origin. `moves` is 1 where a motion changes a residual, else 0.
+        the object's origin. `moves` is 1 where a motion moves the link of a residual, else 0. For a
+        residual between two links it is that of the second minus that of the first. Its axis g may
+        be missing.
         """
         by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
         coupling = self.hand.motion.coupling

@@ -31,7 +31,9 @@ from torchgrasp.values.specs import GRAVITY
 
 @dataclasses.dataclass(frozen=True)
 class DragNumbers:
-    """Parameters of a drag to the edge."""
+    """Parameters of a drag: the hand presses on an object from above and moves it to the table's
+    edge.
+    """
 
     behind: float = 0.015
     """Least distance [m] of the centre of mass behind the table's edge, over the table, at the end
@@ -101,22 +103,25 @@ class DragNumbers:
     support: float = 0.005
     """Distance [m] before and behind a pressing tip to which the top must reach: else it rolls."""
     carried: float = 1.5
-    """Ratio of the load that the grasps after the drag must resist to the weight. The lever of the
-    weight is known to a third.
+    """Load that the grasps after the drag must resist, as a multiple of the object's weight. The
+    lever of the weight is known to a third.
     """
     least: float = 1.0
     """Least pressing force [N]: sensors are off by 0.1 N."""
     most: float = 20.0
     """Greatest pressing force [N], as thin things bend and hands are weak."""
     enough: float = 1.5
-    """Least ratio of the pressing force to the least one, for an object that needs more than `most`.
+    """Least ratio of `most` to the least pressing force that moves the object. With a smaller ratio
+    the object is too heavy.
     """
     sure: float = 0.1
     """Probability that the friction is less than that on which the drag counts."""
     sunk: float = 0.005
     """Greatest depth [m] of a pressing tip in the estimated shape: estimates are a few mm off."""
     ended: float = 0.85
-    """Share of simulated drags of authored bodies that ended as planned."""
+    """Factor on the predicted success of a grasp after a drag: the share of simulated drags that
+    ended as planned.
+    """
     shortest: float = 0.002
     """Length [m] up to which a drag is not worth while: sensors are off by as much."""
 

@@ -430,10 +430,13 @@ def try_request(
     """Plan a request with a small library of postures; return (losses, expected success, object).
 
     The losses are how many candidates each planning stage lost. The expected success, in [0, 1], is
-    the mean predicted success of the best grasps. They are one for every 5 initial guesses
-    (`EXPLAIN.judged`). Several sets of fingers share the initial guesses; losses and success are
-    those of the best set. If no contact set is found, the most relaxed constraints are tried, too.
-    The returned object is prepared for the last set of fingers (`pose`).
+    the mean predicted success of the best n / 5 grasps from n initial guesses (`EXPLAIN.judged`).
+    A missing grasp counts as 0. If no contact set is found, the most relaxed constraints are tried,
+    too.
+
+    The request may allow several sets of grasping fingers. Each set then gets an equal share of the
+    initial guesses; losses and success are those of the best set. The returned object is prepared
+    for the last set (`pose`).
 
     Args:
         request: the arguments of the plan.

@@ -21,7 +21,9 @@ from torchgrasp.geometry.plane import Plane
 
 @dataclasses.dataclass(frozen=True)
 class LeaningNumbers:
-    """Bounds by which sides of objects lean alike."""
+    """Bounds by which the sides of several objects lean alike, as by a wrong focal length. The user
+    is then told (`tell_leaning`).
+    """
 
     points: int = 150
     """Least number of points of an object whose sides are looked at."""

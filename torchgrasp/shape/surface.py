@@ -48,11 +48,14 @@ class SurfaceNumbers:
     steps: int = 3
     """Greatest number of Newton steps that move a vertex onto the surface."""
     least_slope: float = 1e-12
-    """Least squared slope of the mean (no unit) that is a divisor."""
+    """Least square of the mean's slope (no unit) by which Newton steps divide: smaller ones are
+    raised to it.
+    """
     settled: float = 1e-4
     """Normalised motion below which a vertex is on the surface."""
     share: float = 0.02
-    """Least share of the cloud's points that are nearest to a piece of the zero level that is kept.
+    """Least share of the cloud's points to which a piece of the zero level must be nearest. Other
+    pieces are left out; the one with the largest share always stays.
     """
 
 

@@ -111,6 +111,9 @@ def _no_view(cloud: PointCloud) -> BadArgument | None:
 class CloudCut(Command):
     """Write the points of one object in a scene, without those of the table, and the plane of the
     table.
+
+    Both go into the same file; the plane is also printed. Point and box are in metres, in the frame
+    of the cloud. Points outside the box are left out.
     """
 
     cloud: Path = positional(

@@ -68,10 +68,11 @@ def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 class StabilityModel(Value):
     """The learned stability model of one hand: two Gaussian mixtures over the states of grasps.
 
-    A state (`state_of`) has nine numbers. They are the logarithms of three springs' stiffnesses
-    [N/m], three fingertips' distances from their centroid [m], and three forces [N]. `stable` is
-    the density of stable grasps, `others` that of all others. `share` is the prior probability of
-    stable grasps. `meta` holds texts on the hand, the bodies, trials, seed and scores.
+    A state (`state_of`) holds the natural logarithms of nine numbers, three of each kind. These are
+    the stiffnesses of the virtual springs [N/m], the distances of the fingertips from their
+    centroid [m], and the normal forces [N]. `stable` is the density of stable grasps, `others` that
+    of all others. `share` is the prior probability of stable grasps. `meta` holds texts on the
+    hand, the bodies, trials, seed and scores.
     """
 
     stable: GaussianMixture  # density of the states of stable grasps
