@@ -123,11 +123,11 @@ class CloudCut(Command):
     view: inputs.ViewOptions = nested(inputs.ViewOptions())
     point: tuple[float, float, float] | None = option(
         None,
-        "a point on or near the object; points farther than 0.5 m away are left out. By default "
-        "the largest",
+        "a point [m] on or near the object; points farther than 0.5 m away are left out. By "
+        "default the largest",
     )
     box: tuple[float, float, float, float, float, float] | None = option(
-        None, "two corners of a box to cut first"
+        None, "two corners [m] of a box; points outside are left out first"
     )
     gap: float = option(0.02, "least distance between two objects [m]")
 
