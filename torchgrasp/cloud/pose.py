@@ -544,11 +544,16 @@ def tell_layer(points: Points, plane: Plane) -> tuple[str, ...]:
 
 
 def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -> tuple[str, ...]:
-    """Raise `BadArgument` for a unit of the depth that makes objects too large or small for a hand.
+    """Raise `BadArgument` if the sizes of objects and the camera's height show a wrong depth unit.
 
-    Returns one note, a sentence, if the camera is over 1 m high (`SIZES.high`), else none. A camera
-    near to tiny objects gives one, too. `labels` (n,) holds the object of each of the `points` (n,
-    3) [m], 0 for none; `plane` is the table. The camera's `pose` (4, 4) [m] leads to their frame.
+    The height is that above the table `plane`. Most objects are too large if over 0.2 m under a
+    camera above 1.5 m. They are so, too, if over 0.5 m under one above 1 m. There 0.12 m is too
+    much if a usual wrong unit explains the table's place. All objects are too small if under 0.03 m
+    and the camera is below 0.12 m (`SIZES`).
+
+    Otherwise the result is one note, a sentence, or none. The note is for a camera above 1 m, or
+    one below 0.2 m if all objects are under 0.05 m. `labels` (n,) holds the object of each of the
+    `points` (n, 3) [m], 0 for none. The camera's `pose` (4, 4) [m] leads to their frame.
     """
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
     large_enough = [part for part in parts if len(part) >= SIZES.points]

@@ -47,17 +47,17 @@ class FaultNumbers:
     deepest: float = 0.01
     """Greatest depth [m] of a pixel behind this mean at which it counts as in a corner."""
     beside: int = 3
-    """Side [px] of the square about a pixel in which a jump of depth makes it an edge. The square
-    holds the pixel and its direct neighbours.
+    """Side [px] of the square about a pixel in which a jump of depth is sought. A pixel with one is
+    at the border of the strip that is lost along rims (`SensorNoise.worn`).
     """
     fine: float = 0.5
     """Standard deviation [px] of the Gaussian blur of the noise `SensorNoise.fine`. With it, the
     noise of adjacent pixels is similar, and that of pixels farther apart is nearly independent.
     """
     spread: float = 0.2
-    """Share of the depth difference to each neighbour that a step of smoothing takes away. Below a
-    quarter the steps are stable. Each step adds twice this share to the variance [px^2] of the
-    blur.
+    """Factor of the steps of diffusion that blur the depth image (`SensorNoise.smoothing`). A step
+    adds this share of the depth differences to the four neighbours to a pixel's depth. Steps are
+    stable below a quarter. Each adds twice this share to the variance [px^2] of the blur.
     """
 
 

@@ -217,15 +217,17 @@ class Touches:
 
 
 class Localization:
-    """Search for the displacement of the object that best explains a list of touches; each call
-    tries one rotation angle.
+    """Search for the displacement of the object that best explains a list of touches.
 
-    Later touches weigh more, because each touch may move the object. If the hand touched nothing
-    (`Touches.nothing`), the object is probably not where the hand closed.
+    Each call, without arguments, tries one rotation about the table's normal with shifts along the
+    table. Call it until it is `done`; `displacement` is the best one so far. Later touches weigh
+    more, because each touch may move the object. If the hand touched nothing (`Touches.nothing`),
+    the object is probably not where the hand closed.
 
     Args:
         reference: the closing plan, with a surface and a table.
-        touches: touches of one attempt or stop each, in the order of time.
+        touches: what the hand touched, the earliest first. There is one `Touches` for each time it
+            closed, or stopped on its approach.
     """
 
     def __init__(self, reference: ClosingReference, touches: Sequence[Touches]) -> None:

@@ -52,10 +52,14 @@ BOUNDS = ObservationNumbers()
 
 
 class ObservationCheck:
-    """Check of what a robot measures, for one `GraspController`.
+    """Check at each control tick that a robot's observation is plausible for the planned hand.
+
+    A call raises `BadArgument` for joints that jump or are far off at the start of the closing. It
+    also does so for forces, contacts or an upward vector of a wrong sign, unit or frame. It
+    remembers earlier ticks, so each `GraspController` has its own check.
 
     Args:
-        reference: the closing plan.
+        reference: the closing plan, with the hand and its sensor.
     """
 
     def __init__(self, reference: ClosingReference) -> None:

@@ -61,11 +61,13 @@ class OrderNumbers:
     grasps: int = 8
     """Least number of grasps from which the order is judged: of fewer, one side may be chance."""
     one_side: float = 0.9
-    """Least length of a mean over all grasps at which the object's origin counts as on one side. It
-    is the mean unit vector from the hand to this origin, in the hand's frame.
+    """Length of a mean vector above which the object's origin is on one side of most hands. The
+    vector is the mean over all grasps of the unit vector from the hand to this origin. It is in the
+    hand's frame. The other order must exceed this length to be judged right.
     """
     any_side: float = 0.6
-    """Greatest length of this mean in the assumed order at which the assumed order is judged wrong.
+    """Length of this mean vector below which the origin is on any side. The assumed order must be
+    below it to be judged wrong.
     """
 
 

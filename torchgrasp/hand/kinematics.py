@@ -152,21 +152,22 @@ class KinematicTree(Value):
 
 @dataclasses.dataclass(frozen=True)
 class FreeMotion(Value):
-    """Matrices that tell how links of a free-floating hand, and markers on them, move in a small
-    step of its pose and joints.
+    """Constant matrices for derivatives of link poses of a free-floating hand, and of points and
+    directions on its links.
 
-    A step has d = 6 + h numbers: 6 for the root link's pose, and h for the actuated joints. It
-    gives the hand q motions, each a translation or a rotation. They are three translations along
-    the root's axes, and three rotations about them. Then comes the motion of each joint that an
-    actuated joint moves.
+    A step is a small change of pose and joints, with d = 6 + h numbers. They are a translation [m]
+    and a rotation vector [rad] along the root link's axes, then h actuated joints [rad or m]. A
+    step makes the hand perform q motions, each a translation [m] or a rotation [rad]. The first six
+    are translations along the root's axes, then rotations about them. The others are the motions of
+    all joints that an actuated joint moves.
 
-    A marker is a point or a direction that is fixed to a link. Markers come in groups. First come
-    the given groups. Then come the origins, the rotation axes and the translation axes of all
-    motions, three groups of q markers. One of the two axes of a motion is zero.
+    A marker is a point or a direction that is fixed to a link. The m markers come in groups, first
+    those given to `of`. Three groups of q markers follow, with one marker for each motion: its
+    origin, its rotation axis and its translation axis. The axis of the other kind is zero.
     """
 
-    # matrix that maps the k = 4 l numbers of one coordinate of the frames of the l links to that of
-    # all m markers
+    # matrix that gives x, y or z of the m markers from row x, y or z of the poses (3 x 4) of the l
+    # links; these rows have k = 4 l numbers, in the order column of the pose, then link
     product: Float[Tensor, "m k"]
     sizes: tuple[int, ...]  # number of markers in each group
     moves: Float[Tensor, "l q"]  # 1 if motion q moves link l, else 0

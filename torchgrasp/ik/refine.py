@@ -40,11 +40,13 @@ class OpeningNumbers:
     """Parameters of the optimisation that opens a hand from its grasp to its pre-grasp."""
 
     gap: float = 0.012
-    """Distance [m] that each tip moves off its contact on a certain surface."""
+    """Distance [m] that each tip moves off its contact if the surface there is exactly known."""
     deviations: float = 3.0
-    """Number of the surface's standard deviations by which a tip moves farther."""
+    """Number of standard deviations of the surface at the contact that are added to `gap`."""
     solved: float = 1.0
-    """Sum of squared residuals [mm2] of an opened hand: half a millimetre at a tip."""
+    """Sum of squared residuals [mm2] below which the optimisation ends. Residuals of tips are twice
+    their errors, so an error of half a millimetre at one tip gives this sum.
+    """
     steps: int = 12
     """Greatest number of steps of the optimisation."""
 

@@ -54,7 +54,7 @@ class DragNumbers:
     cell: float = 0.001
     """Spacing [m] of the map of the object's top."""
     places: int = 60
-    """Number of these places that are tried, those nearest to the centre of mass."""
+    """Greatest number of places to press that are tried, those nearest to the centre of mass."""
     postures: int = 40
     """Number of postures that press with two tips, and number of those with one, that are tried at
     each place.
@@ -73,7 +73,9 @@ class DragNumbers:
     flat: float = 0.003
     """Largest difference [m] of heights on this circle."""
     near: float = 0.0025
-    """Largest horizontal distance [m] of a place on the top from a point of it."""
+    """Largest horizontal distance [m] of a node of the map from the nearest sampled point of the
+    top. Nodes farther away are beside the top.
+    """
     clear: float = 0.003
     """Least clearance [m] of all other links from the object and the table."""
     aside: tuple[float, ...] = (0.0, 30.0, -30.0, 60.0, -60.0)
@@ -104,7 +106,7 @@ class DragNumbers:
     """Distance [m] before and behind a pressing tip to which the top must reach: else it rolls."""
     carried: float = 1.5
     """Load that the grasps after the drag must resist, as a multiple of the object's weight. The
-    lever of the weight is known to a third.
+    excess is because the lever arm of the weight is uncertain by a third.
     """
     least: float = 1.0
     """Least pressing force [N]: sensors are off by 0.1 N."""

@@ -47,11 +47,13 @@ steps.
 
 
 def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:
-    """Yield lists with the grasps of each object, one list for each batch of initial guesses.
+    """Yield a list after each batch of initial guesses: for each object, the grasps that this batch
+    finished.
 
-    Executable grasps come first. The grasps are in the upright frame. Their `meta` says how many
-    initial guesses were planned so far. No batch begins after `deadline` [s], a time of
-    `time.monotonic`.
+    Grasps of earlier batches are not repeated. A search that goes on gives its grasp in a later
+    batch. Executable grasps come first. The grasps are in the upright frame of their object. Their
+    `meta` has, as "starts", the number of initial guesses planned so far. No batch begins after
+    `deadline` [s], a time of `time.monotonic`.
     """
     sizes = objects.sizes
     drawn = draw(objects, [size.starts for size in sizes if size.starts])

@@ -48,8 +48,8 @@ class SurfaceNumbers:
     steps: int = 3
     """Greatest number of Newton steps that move a vertex onto the surface."""
     least_slope: float = 1e-12
-    """Least square of the mean's slope (no unit) by which Newton steps divide: smaller ones are
-    raised to it.
+    """Least divisor in a Newton step, which divides by the squared length of the mean's gradient
+    (no unit). Smaller ones are raised to it.
     """
     settled: float = 1e-4
     """Normalised motion below which a vertex is on the surface."""

@@ -120,14 +120,16 @@ def keep_promise(grasps: Grasps, share: float) -> Grasps:
 
 
 def by_success(grasps: Grasps, *groups: Int[Tensor, "g"]) -> Grasps:
-    """Return grasps sorted by the keys `groups`, the smallest first, and within a group by their
-    predicted success.
+    """Return grasps sorted by the keys `groups`, and those of equal keys by predicted success.
 
-    Executable grasps with a known success come first, then other executable ones, then failed ones.
-    Within each of these the score falls; between equal scores, the greater margin of the
-    certificate comes first. With an arm, grasps of equal success in whole per cent are sorted
-    further. They are in falling order of the product of the numbers in `grasps.ease`: easily
-    reached grasps come first.
+    Each key holds a number for each of the g grasps, and the smallest comes first. The first key
+    counts most; without keys, only the success counts. Executable grasps with a known success come
+    first, then other executable ones, then failed ones. Each of these classes is in falling order
+    of the score. Between equal scores, the greater margin of the certificate comes first.
+
+    With an arm (`grasps.ease` is not None), each class is sorted by the success in whole per cent.
+    Between equal ones, the greater product of the numbers in `grasps.ease` comes first. These
+    grasps are easily reached. Then the score and the margin count, as without an arm.
     """
     late = 2 * (grasps.status != Status.OK).int()
     late = late if grasps.known is None else late + (~grasps.known & (late == 0)).int()

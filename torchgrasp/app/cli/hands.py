@@ -349,13 +349,13 @@ def describe_abilities(abilities: HandAbilities) -> str:
 
 
 def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
-    """Return warnings about a hand without faults, each with its fix.
+    """Return warnings about a hand whose files have no errors, each a sentence with its fix.
 
-    With three fingers, they tell if fewer than 20 % of the postures are free of self-collision
-    (`TRIAL.least_free`). With more fingers this share may be less. They tell if fewer than 0.1 % of
-    the free postures can hold an object. They name the fingertip pads that face the others in fewer
-    than 2 % of the free postures. `joints` (n, h) are n random postures of the h actuated joints
-    [rad].
+    A warning is given if too few postures are free of self-collision. With three fingers that is
+    fewer than 20 % (`TRIAL.least_free`). With f fingers the bound is this share to the power f / 3.
+    Another is given if fewer than 0.1 % of the free postures can hold an object. Another names each
+    fingertip pad that faces the others in fewer than 2 % of the free postures. `joints` (n, h) are
+    n random postures of the h actuated joints [rad].
     """
     warnings = []
     free = hand.self_clearance(joints) > 0

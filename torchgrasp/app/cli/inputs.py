@@ -393,11 +393,12 @@ def holding(
 
 
 def load_fingers(hand: str, fingers: str) -> tuple[Hand, Literal["auto"] | None]:
-    """Return the hand with its chosen fingers, then "auto" if the planner is to try all its sets.
+    """Return the hand with its chosen fingers, then "auto" if the planner is to try all its sets of
+    fingers, else None.
 
-    Otherwise the second result is None. `hand` is a name or a folder. `fingers` is a set of fingers
-    of the hand, their number, their names with commas between, or "auto". For "auto" the hand has
-    its default fingers. Raises `BadArgument`, which names --hand or --fingers, for an unknown one.
+    `hand` is a name or a folder. `fingers` is the name of a set in its hand.toml ("default"), a
+    number of fingers ("4"), or names ("index,middle,thumb"). Or it is "auto"; then the hand has its
+    default fingers. Raises `BadArgument`, which names --hand or --fingers, for an unknown one.
     """
     with naming(hand="--hand", name="--hand", name_or_path="--hand", fingers="--fingers"):
         return (load_hand(hand), "auto") if fingers == "auto" else (load_hand(hand, fingers), None)

@@ -124,8 +124,10 @@ class Completion(Value):
     """The estimated hidden side of an object in a view: m points, with their errors along the
     normals.
 
-    The errors have the covariance noise^2 I + D D^T [m^2]. I is the identity, D is `deviations`,
-    and noise is 3 mm (`HIDDEN.noise`). Points are in the frame of the cloud.
+    The errors have the covariance noise^2 I + D D^T [m^2]. I is the identity, and noise is 3 mm
+    (`HIDDEN.noise`). D (m, k) is the property `deviations`. Its columns are `shared`, then those of
+    a smooth random error. The variance of the latter at a point is the sum of squares of
+    `asymmetry` and `shared` there. Points are in the frame of the cloud.
     """
 
     points: Float[Tensor, "m 3"]  # estimated points [m] on the hidden side
