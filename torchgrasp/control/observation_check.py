@@ -17,7 +17,7 @@ from torchgrasp.geometry.linalg import check_unit_vectors
 
 
 @dataclasses.dataclass(frozen=True)
-class ObservationNumbers:
+class ReadingNumbers:
     """Bounds beyond which an observation has another sign, unit or frame, or is of another hand."""
 
     noises: float = 10.0
@@ -48,7 +48,7 @@ class ObservationNumbers:
     """Sum of the forces [N] with which they pull: above the weight of the fingers."""
 
 
-BOUNDS = ObservationNumbers()
+BOUNDS = ReadingNumbers()
 
 
 class ObservationCheck:
