@@ -38,7 +38,7 @@ ALL = ("index", "middle", "ring", "thumb")
 def grasps():
     """Grasps of the shipped cylinder with all fingers of the Allegro."""
     return plan_grasps(
-        load_object("cylinder").view, load_hand("allegro"), SPEC, starts=12, fingers=4
+        load_object("cylinder").view, load_hand("allegro"), SPEC, starts=20, fingers=4
     )
 
 

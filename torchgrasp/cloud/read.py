@@ -119,6 +119,7 @@ class CloudFile(Value):
     table: Plane | None = None
     doubts: tuple[str, ...] = ()
 
+    @checked
     def tell(self, name: str) -> PointCloud:
         """Return the cloud. Warn (`CloudWarning`) of the doubts; `name` is that of the file."""
         for doubt in self.doubts:
