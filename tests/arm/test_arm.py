@@ -171,5 +171,6 @@ def test_joints_in_degrees_are_refused_and_an_arm_keeps_its_pose(tmp_path):
     mount[2, 3] = 0.1
     assert torch.equal(arm.hand_poses(joints), pose)
     arm.hand_poses(arm.upper[None] + 0.1)
+    assert arm.hand_poses(joints[:0]).shape == (0, 4, 4)
     with pytest.raises(BadArgument, match=r"joints: .*radians"):
         arm.hand_poses(torch.rad2deg(joints))

@@ -140,10 +140,11 @@ class Arm(Value):
 
         Raises `BadArgument` for a joint over 1 rad or 1 m beyond its limits, as one in degrees.
         """
-        beyond = torch.maximum(self.lower - joints, joints - self.upper).amax(0)
-        if len(joints) and float(beyond.max()) > ARM.astray:
-            name = self.joint_names[int(beyond.argmax())]
-            found = f"{name} {float(beyond.max()):.3g} beyond its limits"
+        beyond = torch.maximum(self.lower - joints, joints - self.upper)  # (k, n)
+        if bool((beyond > ARM.astray).any()):
+            most = beyond.amax(0)
+            name = self.joint_names[int(most.argmax())]
+            found = f"{name} {float(most.max()):.3g} beyond its limits"
             raise BadArgument("joints", found, "positions in radians, or metres of sliding joints")
         return self.obj_from_base @ self.tree.poses(joints)[:, -1] @ self.tip_from_hand
 

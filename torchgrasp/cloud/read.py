@@ -29,10 +29,10 @@ from torchgrasp.foundation.errors import (
     CloudWarning,
     TooFewPoints,
 )
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import CLOUD_BYTES, CLOUD_POINTS
 from torchgrasp.foundation.rules import check_unmasked
 from torchgrasp.foundation.told import warn_user
-from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.linalg import unit as unit_vectors
 from torchgrasp.geometry.plane import Plane
@@ -542,11 +542,11 @@ def _tell_own_frame(cloud: PointCloud, turn: Float[Tensor, "4"]) -> list[str]:
     eye = cloud.viewpoint
     if eye is None or not is_before_origin(points):
         return []
-    half = norm(turn[1:])
     past = False
     # a camera that is not turned has no direction that anybody gave
-    if float(half) > 0:
-        axes = rotation_from_vector(2 * torch.atan2(half, turn[0]) * turn[1:] / half)
+    if float(norm(turn[1:])) > 0:
+        rotation = spatial.transform.Rotation.from_quat(turn[[1, 2, 3, 0]].numpy())
+        axes = torch.from_numpy(rotation.as_matrix()).to(points)
         ahead = unit_vectors(points.mean(0) - eye) @ axes
         past = max(float(ahead[0]), float(ahead[2])) < GUESS.ahead
     own = is_lattice(points, torch.zeros_like(eye)) and not is_lattice(points, eye)
