@@ -31,6 +31,7 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.values.closing import ClosingOptions
 from torchgrasp.values.distribution import Distribution
+from torchgrasp.values.specs import GRAVITY
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 
@@ -57,7 +58,10 @@ def test_a_cylinder_is_held(name):
         float(rise), abs=0.005
     )
     assert result.object_motion.distance < 0.01 and result.object_motion.angle < 0.2
-    assert float(result.forces[-25:].amax(-1).mean()) == pytest.approx(4.0, rel=0.15)
+    # the hand carries the weight by friction, and gives up its reserve for a heavier object
+    held = result.forces[-10:]
+    assert float(held.sum(-1).amin()) > QUICK.mass * GRAVITY / QUICK.friction
+    assert float(held.max()) < 0.6 * float(result.forces.max())
     assert len(result.time) == len(result.forces) == len(result.joints) == len(result.hand_pose)
     assert set(result.joint_names) == set(load_hand(name).tree.joint_names)
 
@@ -67,11 +71,12 @@ def test_a_cylinder_is_held(name):
 def test_same_seed_same_bits_here_and_in_another_process(simulator):
     pytest.importorskip(simulator)
     spec = dataclasses.replace(QUICK, simulator=simulator)
-    first, second = (digest(close("allegro", spec=spec, seed=3)) for _ in range(2))
+    # after other trials here; the first of its process there
+    here = digest(close("allegro", spec=spec, seed=3))
     other = digest(quick_trial("allegro", simulator))
     installed = tuple(name for name in ("sapien", "mujoco") if find_spec(name))
     elsewhere = digests_elsewhere("allegro", installed, 3)
-    assert first == second == elsewhere[simulator] and first != other
+    assert here == elsewhere[simulator] and here != other
 
 
 @pytest.mark.parametrize(("name", "aside"), [("allegro", -0.008), ("barrett", 0.008)])

@@ -28,8 +28,9 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.closing import ClosingOptions
 from torchgrasp.values.distribution import Distribution
 
-# time [s] from the end of closing until the hand counts as closed, and is judged
-PRESSING_TIME = 0.5
+# time [s] from the end of closing until the hand counts as closed, and may be lifted: by then the
+# holding mode "grip" presses with its whole reserve for an unknown weight
+PRESSING_TIME = 0.9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +62,8 @@ class GraspCheckNumbers:
     """Time [s] of pressing from which touches are averaged."""
     last: float = 0.3
     """Time [s] of pressing until which touches are averaged."""
+    judging: float = 0.5
+    """Time [s] of pressing after which the grasp is judged: the forces are those of the closing."""
     misplaced: float = 0.008
     """Largest difference [m] of two translations in a secure grasp: those of object and palm since
     the planned poses. It is twice the error of the estimated translation.
@@ -223,7 +226,7 @@ class GuardedApproach:
             self.inertia = torch.maximum(self.inertia, pushes)
         excess = pushes - self.inertia - APPROACH.noises * TORQUE_NOISE  # (j,) [N m]
         spheres = hand.collision_spheres
-        if self.speed < APPROACH.moving or bool((excess <= 0.0).all()):
+        if self.speed < APPROACH.moving or (excess <= 0.0).all():
             return torch.zeros(0, 4, dtype=torch.float64)
         # a link beyond the most blocked joint touches
         moved = hand.tree.moves[:, excess.argmax()][spheres.link_index] > 0
@@ -239,7 +242,7 @@ class GuardedApproach:
         if self.time < APPROACH.feeling:
             self.time += period
             last.add(observation, self._displaced())
-        elif not self.search.done and (bool(last.felt.any()) or len(last.links)):
+        elif not self.search.done and (last.felt.any() or len(last.links)):
             self.search()
         else:
             self.feeling = False
@@ -296,8 +299,8 @@ class GraspCheck:
         self.secure = last
 
     def __call__(self, observation: Observation, pressed: float) -> None:
-        """Average the touches, locate the object, and judge the grasp when `pressed` [s] reaches
-        `PRESSING_TIME`.
+        """Average the touches, locate the object, and judge the grasp when `pressed` reaches 0.5 s
+        (`CHECK.judging`).
         """
         if self.judged or pressed < CHECK.first:
             return
@@ -305,12 +308,12 @@ class GraspCheck:
             self.touches.add(observation, self.palm)
         elif self.known and not (self.search and self.search.done):
             if self.search is None:
-                if bool(self.touches.felt.any()):
+                if self.touches.felt.any():
                     self.felt[-1] = self.touches
                 self.search = Localization(self.reference, self.felt)
             self.search()
             self.displacement = self.search.displacement
-        elif pressed >= PRESSING_TIME - EARLY:
+        elif pressed >= CHECK.judging - EARLY:
             self.touches.contact = observation.tactile.contact
             self.judged = True
             self.secure = self._is_secure()
@@ -320,11 +323,11 @@ class GraspCheck:
         followed.
         """
         touches = self.touches
-        if not bool((touches.contact | ~touches.known).all()):
+        if not (touches.contact | ~touches.known).all():
             return False
         if float(norm(self.displacement[:3] - self.palm)) > CHECK.misplaced:
             return False
-        if not bool(touches.felt.all()):
+        if not touches.felt.all():
             # without all places of contacts the forces cannot be judged
             return True
         points, normals = touches.means()
