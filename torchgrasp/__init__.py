@@ -5,6 +5,7 @@ public names.
 """
 
 from torchgrasp.foundation.garbage import uncollected as _uncollected
+from torchgrasp.foundation.lazy import module_late as _module_late
 
 with _uncollected():
     from torchgrasp.foundation.errors import GraspError, Status
@@ -51,6 +52,9 @@ with _uncollected():
     from torchgrasp.control.reference import ClosingReference, closing_gains
     from torchgrasp.control.controller import GraspController
     from torchgrasp.evaluation.lift import close_hand
+
+# grasps show themselves in notebooks; what draws them needs all stages
+Grasps.pages = _module_late("torchgrasp.app.report.notebook")
 
 __version__ = "0.1.0"
 

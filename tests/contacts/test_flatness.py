@@ -13,6 +13,7 @@ from tests.make import CUP_RADIUS as RADIUS
 from tests.make import cup_view, real
 from tests.make import cylinder_points as ring
 from torchgrasp import fit_shape
+from torchgrasp.contacts.descent import project
 from torchgrasp.contacts.feasibility import (
     GUIDING_POINTS,
     INSIDE,
@@ -21,7 +22,6 @@ from torchgrasp.contacts.feasibility import (
 )
 from torchgrasp.contacts.form_closure import tangents
 from torchgrasp.contacts.problem import triple_jet
-from torchgrasp.contacts.solver import project
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.hollow import HollowShape
 

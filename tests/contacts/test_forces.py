@@ -17,6 +17,7 @@ from torchgrasp.contacts.balance import (
     least_friction_forces,
     tangential_ratio,
 )
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 
@@ -157,6 +158,15 @@ def test_least_friction_forces_of_a_pinch_are_even_turn_with_the_frame_and_need_
     assert torch.isnan(
         least_friction_forces(points, normals[:1].expand(3, 3).contiguous(), 4.0)
     ).all()
+
+
+def test_normals_of_another_length_are_refused_as_their_forces_would_be_too_small():
+    points, normals = pinch()
+    for factor in (0.5, 3.0):
+        with pytest.raises(BadArgument, match="normals: expected unit vectors"):
+            least_friction_forces(points, factor * normals, 6.0)
+    unknown = torch.full_like(normals, torch.nan)
+    assert torch.isnan(least_friction_forces(points, unknown, 6.0)).all()
 
 
 def test_search_and_central_forces_agree():

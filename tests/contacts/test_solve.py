@@ -10,11 +10,11 @@ import torch
 
 from tests.make import near, real, spokes
 from torchgrasp import ContactSpec, certify
+from torchgrasp.contacts.descent import project
 from torchgrasp.contacts.feasibility import check_feasibility, first_violation, normal_variation
 from torchgrasp.contacts.form_closure import closed_exact, wrenches
 from torchgrasp.contacts.plan import TO_CENTRE, plan_chunk, plan_contacts
 from torchgrasp.contacts.problem import ContactProblem
-from torchgrasp.contacts.solver import project
 from torchgrasp.contacts.starts import (
     STARTS_PER_CHUNK,
     candidate_rows,

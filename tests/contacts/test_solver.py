@@ -10,18 +10,18 @@ from torch import Tensor
 
 from tests.make import largest_share
 from torchgrasp import ContactSpec, fit_shape, load_object, plan_contacts
-from torchgrasp.contacts.form_closure import rank_ratio, wrenches
-from torchgrasp.contacts.problem import ContactProblem, forces_from_tensions
-from torchgrasp.contacts.solver import (
+from torchgrasp.contacts.descent import (
     LONGEST_STEP,
     Descent,
     Stage,
     State,
-    descend,
     project,
     promised_decrease,
     start_state,
 )
+from torchgrasp.contacts.form_closure import rank_ratio, wrenches
+from torchgrasp.contacts.problem import ContactProblem, forces_from_tensions
+from torchgrasp.contacts.solver import descend
 from torchgrasp.geometry.linalg import unit
 
 SPEC = ContactSpec.paper()

@@ -39,6 +39,7 @@ from torchgrasp.foundation.rules import ANY, Positive
 from torchgrasp.geometry.frames import skew
 from torchgrasp.geometry.linalg import (
     GOLDEN_ANGLE,
+    check_unit_vectors,
     dot,
     eye_like,
     fibonacci_sphere,
@@ -188,7 +189,8 @@ def least_friction_forces(
         preferred: ratios (*b, f) or (f,) of the normal forces to prefer among forces of similar
             friction, without unit. None means equal ones.
 
-    Raises `BadArgument` for another number of contacts, or a `strongest` that is not positive.
+    Raises `BadArgument` for another number of contacts, normals that are not of length 1 (to
+    1e-3), or a `strongest` that is not positive.
 
     >>> points = torch.tensor([[[0.0, 1, 0], [0, 0, 0], [1, 0.5, 0]]])
     >>> normals = torch.tensor([[[-1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]])
@@ -198,6 +200,9 @@ def least_friction_forces(
     f = count_contacts(points)
     p = points.double().reshape(-1, f, 3)
     n = normals.double().reshape(-1, f, 3)
+    # elsewhere a plan would wait for the device
+    if n.device.type == "cpu":
+        check_unit_vectors("normals", n)
     if preferred is not None:
         preferred = (preferred / preferred.amax(-1, keepdim=True)).double()
         preferred = preferred.expand(points.shape[:-1]).reshape(-1, f)

@@ -264,8 +264,8 @@ def _search(
     if is_fused(points, normals, load):
         from torchgrasp.contacts import fused_critical  # it imports numba
 
-        good, balances = fused_critical.search(points[left], axes[left], load[left])
-        return left[good], LeastBalance(*(x[good] for x in balances))
+        good, parts = fused_critical.search(points[left], axes[left], load[left], numbers)
+        return left[good], LeastBalance(*(x[good] for x in parts))
     every = _Cones.of(points, axes, load)
     cones = every.some(left)
     at = cones.first()

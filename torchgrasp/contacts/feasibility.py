@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.contacts.descent import project
 from torchgrasp.contacts.form_closure import (
     BALANCED,
     MIN_MARGIN,
@@ -30,7 +31,6 @@ from torchgrasp.contacts.problem import (
     triple_mean_jet,
     walls_at,
 )
-from torchgrasp.contacts.solver import project
 from torchgrasp.foundation.base import Batch, flatnonzero, spread
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import degenerate

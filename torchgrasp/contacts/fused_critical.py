@@ -7,13 +7,13 @@ and friction are one array of unknowns, in the order of the eight equations.
 
 import collections
 import math
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.contacts import critical
 from torchgrasp.contacts.form_closure import Vectors, scaled_arms
 from torchgrasp.foundation.fused import array, compiled, inlined
 from torchgrasp.geometry.fused_vectors import add, cross, dot, put, scale
@@ -380,17 +380,18 @@ def _search(n, shorter, axes, arms, load, good, forces, press, slide, unknowns):
 
 
 def search(
-    points: Vectors, axes: Float[Tensor, "b f 3 3"], load: Float[Tensor, "b 6"]
-) -> tuple[Bool[Tensor, "b"], "critical.LeastBalance"]:
-    """Return a mask of the contact sets that can balance, and the balances of all sets.
+    points: Vectors, axes: Float[Tensor, "b f 3 3"], load: Float[Tensor, "b 6"], numbers: Any
+) -> tuple[Bool[Tensor, "b"], tuple[Tensor, ...]]:
+    """Return a mask of the contact sets that can balance, and the balances of all sets: the fields
+    of `critical.LeastBalance`, in its order.
 
     The balances of sets that cannot balance mean nothing. `points` (b, f, 3) are the contacts. The
     rows of `axes` (b, f, 3, 3) are the inward normal and two tangents at each contact. `load` (b,
     6) is the wrench that the contacts balance: force, then torque about their centroid. Its forces
     are divided by the mean normal force, and its lengths by the contacts' root-mean-square radius.
+    `numbers` are `critical.CRITICAL`.
     """
     b, f = points.shape[:2]
-    numbers = critical.CRITICAL
     values = SearchNumbers(*(getattr(numbers, name) for name in SearchNumbers._fields))
     good = torch.zeros(b, dtype=torch.bool)
     forces = points.new_zeros(b, f, 3)
@@ -402,5 +403,4 @@ def search(
     with np.errstate(all="ignore"):  # sets that cannot balance end with NaN
         _search(values, *given, *(x.numpy() for x in found))
     twist, scale, friction = unknowns.split([6, 1, 1], 1)
-    parts = forces, friction[:, 0], press, slide, twist, scale[:, 0]
-    return good, critical.LeastBalance(*parts)
+    return good, (forces, friction[:, 0], press, slide, twist, scale[:, 0])

@@ -12,8 +12,8 @@ import math
 import numpy as np
 import torch
 
+from torchgrasp.contacts import descent
 from torchgrasp.contacts import problem as constraint
-from torchgrasp.contacts import solver
 from torchgrasp.foundation.fused import array, compiled, inlined
 from torchgrasp.geometry.fused_vectors import (
     add,
@@ -266,9 +266,9 @@ def _descend(
 def descend(
     shape: ShapeGP,
     problem: "constraint.ContactProblem",
-    state: "solver.State",
-    stage: "solver.Stage",
-) -> "solver.State":
+    state: descent.State,
+    stage: descent.Stage,
+) -> descent.State:
     """Return the contact sets after the Levenberg-Marquardt steps of one solver stage that begins
     with `state`.
 
@@ -284,14 +284,14 @@ def descend(
         stage.steps,
         stage.settled,
         stage.centre,
-        solver.SURFACE,
+        descent.SURFACE,
         stage.cones,
-        solver.BOUNDS,
-        solver.TENSION_DAMPING,
-        solver.LONGEST_STEP,
-        solver.Descent.first_damping,
-        solver.LEAST_DAMPING,
-        solver.MOST_DAMPING,
+        descent.BOUNDS,
+        descent.TENSION_DAMPING,
+        descent.LONGEST_STEP,
+        descent.Descent.first_damping,
+        descent.LEAST_DAMPING,
+        descent.MOST_DAMPING,
         1 / math.sqrt(1 + problem.friction**2) + constraint.CONE_MARGIN,
         threshold,
         2 * threshold**0.5,
@@ -319,7 +319,7 @@ def descend(
     if len(walls) == 1:
         walls += ((np.empty((3, 0)), np.empty(0), np.empty((3, 0)), 1.0),)
     _descend(numbers, walls, array(pairs, torch.int64), array(signs), up, *(x.numpy() for x in new))
-    return solver.State(new[0], new[1], SurfaceJet(*new[2:]))
+    return descent.State(new[0], new[1], SurfaceJet(*new[2:]))
 
 
 def _thin_plate(wall: ShapeGP) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

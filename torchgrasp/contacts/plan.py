@@ -8,10 +8,11 @@ from collections.abc import Iterator
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.contacts.descent import FINISH, Stage, project, start_state
 from torchgrasp.contacts.feasibility import check_feasibility
 from torchgrasp.contacts.form_closure import Vectors
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
-from torchgrasp.contacts.solver import FINISH, Stage, descend, project, start_state
+from torchgrasp.contacts.solver import descend
 from torchgrasp.contacts.starts import (
     check_starts,
     drawn_starts,

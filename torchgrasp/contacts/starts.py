@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchgrasp.contacts.descent import project
 from torchgrasp.contacts.feasibility import normal_variation, within
 from torchgrasp.contacts.form_closure import Vectors, closed_exact
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, device_of, variance_at, walls_of
-from torchgrasp.contacts.solver import project
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import Points, norm, unit
 from torchgrasp.values.specs import FLAT_RADII, ContactSpec

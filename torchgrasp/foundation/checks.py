@@ -15,7 +15,7 @@ import inspect
 import threading
 import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar, overload
@@ -67,6 +67,7 @@ class _Call:
         sizes: the sizes of axes found so far, by their letters.
         finite: tensors whose numbers must be finite, by the argument's name.
         rigid: tensors that must be rigid transforms, by the argument's name.
+        arguments: all arguments of the call, by their names.
     """
 
     gradients: bool
@@ -75,6 +76,7 @@ class _Call:
     sizes: dict[str, Any] = dataclasses.field(default_factory=dict[str, Any])
     finite: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
     rigid: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
+    arguments: dict[str, Any] = dataclasses.field(default_factory=dict[str, Any])
 
     def check_numbers(self) -> None:
         """Raise `BadArgument` if a tensor in `finite` has NaN or infinity, or one in `rigid` is no
@@ -158,7 +160,7 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
             _check_options(signature, kwargs, owner)
         bound = signature.bind(*args, **kwargs)
         arguments = bound.arguments
-        shared = _Call(gradients, deep=not inside)
+        shared = _Call(gradients, deep=not inside, arguments=arguments)
         hints = _hints(owner)
         if is_method:
             shared.sizes.update(_lengths(arguments["self"]))
@@ -227,6 +229,13 @@ def _unchecked() -> Iterator[None]:
             yield
     finally:
         _thread.inside = inside
+
+
+def arguments_beside() -> Mapping[str, Any]:
+    """Return all arguments of the call of which one is converted now (`Taken.read`), by their
+    names. Outside of a conversion there are none.
+    """
+    return getattr(_thread, "arguments", {})
 
 
 def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
@@ -305,7 +314,12 @@ def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> An
     if isinstance(mark, Range):
         return read_number(name, value, hint, mark)
     if isinstance(mark, Taken):
-        return _read(name, mark.read(value, name), mark.kind, call)
+        _thread.arguments = call.arguments
+        try:
+            converted = mark.read(value, name)
+        finally:
+            _thread.arguments = {}
+        return _read(name, converted, mark.kind, call)
     if mark == ANY and hint is float and isinstance(value, float):
         return value
     if mark == ANY and not call.strict:
@@ -485,6 +499,13 @@ def _hint(name: str, signature: inspect.Signature, owner: Any) -> str:
                 return f"; {name} is a field: {option}={kind.__name__}({name}=...)"
     near = difflib.get_close_matches(name, list(signature.parameters), 1)
     return f"; did you mean {near[0]}?" if near else ""
+
+
+def check_value(name: str, value: Any, hint: Any) -> None:
+    """Raise `BadArgument`, which calls the value `name`, if it does not satisfy an annotation."""
+    call = _Call(gradients=True)
+    _read(name, value, hint, call)
+    call.check_numbers()
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:

@@ -135,7 +135,8 @@ def _tell_of_compilation() -> None:
             self.told = False
 
         def on_start(self, event: Any) -> None:
-            module = event.data["dispatcher"].py_func.__module__
+            # numba itself generates functions that are of no module
+            module = event.data["dispatcher"].py_func.__module__ or ""
             if not self.told and module.startswith("torchgrasp."):
                 self.told = True
                 _log.warning("compiling loops, once on this machine; it takes up to a minute")

@@ -9,6 +9,8 @@ import types
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from torchgrasp.foundation.errors import MissingExtra
+
 
 class _Late(types.ModuleType):
     """A stand-in for a module."""
@@ -47,6 +49,23 @@ class _Parts(_Late):
             package.__class__ = _Package
             sys.modules[self.__name__] = package
         return importlib.import_module(f"{self.__name__}.{name}")
+
+
+def module_late(name: str, /) -> Any:
+    """Return a stand-in for the module of this full name, which is imported at its first use."""
+    return _Late(name)
+
+
+def import_extra(module: str, extra: str, package: str) -> Any:
+    """Return a module of an optional package.
+
+    `package` is the package's name, and `extra` the extra of torchgrasp that installs it. Raises
+    `MissingExtra` if the module cannot be imported.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingExtra(package, extra) from error
 
 
 def import_late(package: str, /, **modules: str) -> Callable[[str], Any]:

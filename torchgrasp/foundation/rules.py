@@ -318,6 +318,12 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
         raise BadArgument("to", given, allowed)
 
 
+def check_suffix(name: str, path: Path, *suffixes: str) -> None:
+    """Raise `BadArgument`, which calls the path `name`, unless it ends in one of the `suffixes`."""
+    if path.suffix.lower() not in suffixes:
+        raise BadArgument(name, path, f"a file ending in {' or '.join(suffixes)}")
+
+
 def check_path(name: str, path: Path | str) -> None:
     """Raise `BadArgument` for a path that no file can have. It holds a NUL or half a character (a
     lone surrogate), or is too long: over 4095 bytes, or 255 in one name.

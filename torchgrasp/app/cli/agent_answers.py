@@ -1,10 +1,10 @@
 """The answers of the tools for agents, as records with the meaning and unit of each field."""
 
 import dataclasses
-import math
 from typing import Any
 
 from torchgrasp.app.cli.command import option, required
+from torchgrasp.files import plain_value
 
 Vector = tuple[float, float, float]
 DIGITS = 6  # decimals of numbers in answers [m, rad]: micrometres
@@ -206,20 +206,6 @@ def plain_answer(answer: Answer) -> dict[str, Any]:
 
     Numbers are rounded to 6 decimals; NaN and infinity become None.
     """
-    fields = dataclasses.fields(answer)
-    named = {field.name: getattr(answer, field.name) for field in fields}
-    named.pop("picture")
-    return _plain(named)
-
-
-def _plain(value: Any) -> Any:
-    """Return a value of an answer as JSON has it, with rounded numbers."""
-    if dataclasses.is_dataclass(value):
-        return {name: _plain(x) for name, x in vars(value).items()}
-    if isinstance(value, dict):
-        return {key: _plain(x) for key, x in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(x) for x in value]
-    if isinstance(value, float):
-        return round(value, DIGITS) if math.isfinite(value) else None
-    return value
+    named = dict(vars(answer))
+    del named["picture"]
+    return plain_value(named, DIGITS)

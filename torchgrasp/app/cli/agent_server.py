@@ -30,9 +30,10 @@ from torchgrasp import __version__
 from torchgrasp.app.cli.agent_answers import Answer, plain_answer
 from torchgrasp.app.cli.agent_files import Workplace
 from torchgrasp.app.cli.agent_tools import TOOLS, TellHealth, Tool, make_tool
-from torchgrasp.app.cli.agents import SERVER
 from torchgrasp.app.cli.command import naming
-from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra, one_line
+from torchgrasp.app.cli.server_bounds import SERVER
+from torchgrasp.foundation.errors import BadArgument, GraspError, one_line
+from torchgrasp.foundation.lazy import import_extra
 from torchgrasp.foundation.rules import Range
 
 HOST = "127.0.0.1"  # HTTP is served to programs of this machine alone
@@ -86,14 +87,6 @@ def bind_port(number: int) -> socket.socket:
         raise BadArgument("--http", found, "a free port, or 0 for any") from error
 
 
-def import_mcp() -> Any:
-    """Return the package `mcp`; raise `MissingExtra` if it is not installed."""
-    try:
-        return importlib.import_module("mcp")
-    except ImportError as error:
-        raise MissingExtra("mcp", "mcp") from error
-
-
 class AgentServer:
     """A server of the Model Context Protocol (MCP) that offers torchgrasp's tools to AI agents.
 
@@ -105,7 +98,7 @@ class AgentServer:
     """
 
     def __init__(self, place: Workplace, seconds: float) -> None:
-        import_mcp()
+        import_extra("mcp", "mcp", "mcp")
         self.place = place
         self.seconds = seconds
         self.anyio: Any = importlib.import_module("anyio")

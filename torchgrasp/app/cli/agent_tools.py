@@ -34,7 +34,7 @@ from torchgrasp.app.cli.agent_answers import (
 from torchgrasp.app.cli.agent_files import Workplace
 from torchgrasp.app.cli.clouds import CloudCheck
 from torchgrasp.app.cli.command import naming, option, required
-from torchgrasp.app.cli.depth_images import CloudScene
+from torchgrasp.app.cli.depth_images import CloudScene, DepthUnit
 from torchgrasp.app.cli.doctor import SIMULATORS
 from torchgrasp.app.cli.grasp import Grasp
 from torchgrasp.app.cli.hands import TRIAL, describe, find_warnings, list_faults, list_unusual
@@ -51,7 +51,6 @@ from torchgrasp.app.cli.inputs import (
     object_name,
     read_distribution,
     read_table,
-    without_exact_table,
 )
 from torchgrasp.app.cli.results import (
     ENOUGH,
@@ -203,8 +202,7 @@ class _SeenTool(Tool):
     def see(self, place: Workplace, path: Path) -> "_Seen":
         """Return the cloud of a file with its table; raise `BadArgument` for an unusable cloud."""
         view = self.options(place)
-        file = without_exact_table(view.read("cloud", path), view.vertical)
-        view = view.with_table_of(file)
+        file, view = view.read_standing("cloud", path)
         table = view.plane(file.cloud)
         advice = view.judge(file.cloud, table)
         return _Seen(path, file.cloud, table, (*file.notes, *map(str, advice)))
@@ -406,7 +404,7 @@ class PlanFromDepth(_PlanTool):
         "fx fy cx cy [pixels] at the image's own resolution. Or a file of ROS, Open3D, RealSense, "
         "Zivid or BOP (.json, .yaml)"
     )
-    depth_unit: float | None = option(None, DEPTH_HELP["depth_unit"])
+    depth_unit: DepthUnit | None = option(None, DEPTH_HELP["depth_unit"])
     mask: str | None = option(
         None, "mask of the object (.png, .tiff, .npy), of the depth's size and not 0 there"
     )
@@ -626,10 +624,7 @@ class CheckCloud(_SeenTool):
         path = place.cloud("cloud", self.cloud)
         given: Any = {"file": path, "view": self.options(place)}
         notes, report, refusals = CloudCheck(**given).judge()
-        advice = [
-            AdviceRow(found=one.found, fix=one.fix, refused=one.refused)
-            for one in (*refusals, *report.advice)
-        ]
+        advice = [AdviceRow(**vars(one)) for one in (*refusals, *report.advice)]
         return CloudAnswer(
             usable=not any(one.refused for one in advice),
             advice=tuple(advice),

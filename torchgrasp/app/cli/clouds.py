@@ -25,7 +25,6 @@ from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.data import write_objects
 from torchgrasp.data.shipped import find_view
 from torchgrasp.export import check_surface_path, largest_std, save_surface
-from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.geometry.frames import real
@@ -36,7 +35,6 @@ from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values.planning import PointCloud
 
-GAPS = (0.001, 1.0)  # least and greatest distance between objects that --gap takes [m]
 MOST_TRIED = 20_000  # points with which a camera is sought: more give no more certainty
 
 
@@ -78,9 +76,7 @@ class CloudCheck(ForPrograms):
         could. They are also () if the report already refuses the cloud. Raises `BadArgument` for a
         file that cannot be read.
         """
-        file = self.view.read("FILE", find_view(self.file, "FILE"), whole=True)
-        file = inputs.without_exact_table(file, self.view.vertical)
-        view = self.view.with_table_of(file)
+        file, view = self.view.read_standing("FILE", find_view(self.file, "FILE"), whole=True)
         plane = as_plane(view.plane(file.cloud))
         up = view.given_vertical(plane)
         known = plane if view.table is not None else None
@@ -129,21 +125,15 @@ class CloudCut(Command):
     box: tuple[float, float, float, float, float, float] | None = option(
         None, "two corners [m] of a box; points outside are left out first"
     )
-    gap: float = option(0.02, "least distance between two objects [m]")
+    gap: Annotated[float, Range(0.001, 1.0)] = option(
+        0.02, "least distance between two objects [m]"
+    )
 
     def run(self) -> int:
         """Cut the object out of the cloud and write its points; return the exit code 0."""
-        if not GAPS[0] <= self.gap <= GAPS[1]:
-            raise BadArgument("--gap", self.gap, "a number of metres in [0.001, 1]")
         file = self.view.read("CLOUD", self.cloud, whole=True)
-        near = None
-        box = None
-        if self.point is not None:
-            near = check_tensor("--point", torch.tensor(self.point, dtype=torch.float64), (3,))
-        if self.box is not None:
-            box = check_tensor("--box", torch.tensor(self.box, dtype=torch.float64), (6,)).reshape(
-                2, 3
-            )
+        near = None if self.point is None else real(self.point)
+        box = None if self.box is None else real(self.box).reshape(2, 3)
         up = self.view.vertical
         up = real([0.0, 0.0, 1.0]) if up is None else up
         thing, plane = clouds.cut_object(file.cloud, up, near, box, self.gap)

@@ -20,8 +20,8 @@ from tqdm import tqdm
 
 from torchgrasp.files import format_json
 from torchgrasp.foundation import fused
+from torchgrasp.foundation.checks import check_value
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import Range, check_path, describe
 
 T = TypeVar("T")
 BEAT = 15.0
@@ -130,7 +130,7 @@ def _metavar(kind: Any) -> str:
 
 
 def execute(command: Command) -> int:
-    """Check paths and number ranges of a command's arguments, then run it; return the exit code.
+    """Check a command's arguments by their annotations, then run it; return the exit code.
 
     Errors name the command-line options. Raises `BadArgument` for a number out of its range, or an
     invalid path.
@@ -140,15 +140,10 @@ def execute(command: Command) -> int:
         name: name.upper() if field.metadata.get("positional") else f"--{name.replace('_', '-')}"
         for name, field in fields.items()
     }
-    for name, field in fields.items():
-        value: Any = getattr(command, name)
-        for limits in get_args(field.type):
-            if isinstance(limits, Range) and not limits.low <= value <= limits.high:
-                raise BadArgument(options[name], value, describe(field.type))
-        if isinstance(value, Path):
-            check_path(options[name], value)
     names = options | {argument: options[name] for argument, name in command.names.items()}
     with naming(**names), _speaking(command):
+        for name, field in fields.items():
+            check_value(name, getattr(command, name), field.type)
         return command.run()
 
 

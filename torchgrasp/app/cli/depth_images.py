@@ -4,12 +4,12 @@ or from a cloud.
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from torch import Tensor
 
 from torchgrasp.app.cli.command import Command, arguments, option, positional, required
-from torchgrasp.app.cli.inputs import OUT_CLOUD_HELP, ViewOptions, read_table
+from torchgrasp.app.cli.inputs import OUT_CLOUD_HELP, ViewOptions, read_table, read_up
 from torchgrasp.app.report.scene_picture import draw_scene
 from torchgrasp.cloud import save_cloud
 from torchgrasp.cloud.depth import cloud_from_depth
@@ -17,6 +17,7 @@ from torchgrasp.cloud.pose import read_pose
 from torchgrasp.cloud.safe_files import read_image_file, read_intrinsics
 from torchgrasp.cloud.sensor import median_depth
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import LEAST, Range
 from torchgrasp.scene.file import save_scene
 from torchgrasp.scene.image import is_scene
 from torchgrasp.scene.masks import read_labels, read_mask
@@ -30,6 +31,7 @@ INTRINSICS_HELP = (
     "fx fy cx cy in pixels, at the image's own resolution, and of a crop its width height. Or a "
     "file of ROS, Open3D, RealSense, Zivid or BOP (.json, .yaml), or with a matrix (.npy, .txt)"
 )
+DepthUnit = Annotated[float, Range(LEAST, 1.0, "metres of one count, above 0 and at most 1")]
 
 
 @arguments(points="depth", path="out")
@@ -38,7 +40,7 @@ class _DepthCommand(Command):
 
     depth: Path = positional(DEPTH_HELP)
     intrinsics: tuple[str, ...] = required(INTRINSICS_HELP)
-    depth_unit: float | None = option(
+    depth_unit: DepthUnit | None = option(
         None,
         "metres of one count of the depth: 0.0001 of a RealSense D405, 0.00025 of an L515, 0.001 "
         "of float mm",
@@ -68,8 +70,7 @@ class _DepthCommand(Command):
     @property
     def vertical(self) -> Tensor | None:
         """The unit vector (3,) that points up, in the frame of the results; None without --up."""
-        given: Any = {"up": self.up}
-        return ViewOptions(**given).vertical
+        return read_up(self.up)
 
     def images(self):
         """Return depth image, intrinsics, mask labels and camera pose; what is not given is None.
@@ -78,10 +79,6 @@ class _DepthCommand(Command):
         files. The intrinsics are numbers or a matrix [pixels], the labels (h, w) integers, and the
         pose a matrix (4, 4) [m].
         """
-        if self.depth_unit is not None and not 0 < self.depth_unit <= 1:
-            raise BadArgument(
-                "--depth-unit", self.depth_unit, "metres of one count, above 0 and at most 1"
-            )
         camera = self.intrinsics
         if len(camera) == 1:
             camera = read_intrinsics("intrinsics", Path(camera[0]), self.depth.stem)

@@ -10,10 +10,9 @@ import numpy as np
 
 from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
-from torchgrasp.app.cli.results import GRASPS, SURFACE
+from torchgrasp.app.cli.results import PLANNED_HELP, load_planned
 from torchgrasp.app.report.glb import write_glb
 from torchgrasp.cloud.agreement import check_contacts
-from torchgrasp.data.shards import load_grasps
 from torchgrasp.export.foreign import read_poses
 from torchgrasp.export.postures import follower_joints, stands_still
 from torchgrasp.files import read_bytes, read_json, write_file
@@ -49,9 +48,7 @@ class Export(Command):
     joints.
     """
 
-    grasps: Path = positional(
-        "grasps.safetensors of `torchgrasp grasp`, or its folder, or a file of `evaluate`"
-    )
+    grasps: Path = positional(PLANNED_HELP)
     out: Path = required("file to write; for dexgraspbench, play-... and usd a folder")
     format: Literal[
         "json",
@@ -123,8 +120,7 @@ class Export(Command):
 
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return 0, or 1 for no grasp."""
-        file = self.grasps / GRASPS if self.grasps.is_dir() else self.grasps
-        surface = file.with_name(SURFACE)
+        planned, surface = load_planned(self.grasps)
         replaced = (self._plays or self.format == "glb") and surface.is_file()
         if self._needs_object and self.object is None and not replaced:
             raise BadArgument("--object", None, f"a path with --format {self.format}")
@@ -134,8 +130,6 @@ class Export(Command):
         taken = trial if self._plays else texts
         if unused := [name for name in (*robot, *trial) if name not in taken]:
             raise BadArgument(unused[0], f"--format {self.format}", "a format that it is for")
-        with naming(path="GRASPS"):
-            planned = load_grasps(file)
         hand = hand_of(planned, self.hand)
         if planned.meta.get("hand_sha256") != hand.source.sha256:
             other = f"{hand.name}, whose files are not those that were planned with"

@@ -13,9 +13,8 @@ from torchgrasp.app.cli.command import (
     required,
 )
 from torchgrasp.app.cli.inputs import SEED_HELP, check_folder, import_simulator
-from torchgrasp.app.cli.results import GRASPS, SURFACE, read_true_mesh, table_under
+from torchgrasp.app.cli.results import PLANNED_HELP, load_planned, read_true_mesh, table_under
 from torchgrasp.app.report.moving_picture import Rate, check_kind, write_film
-from torchgrasp.data.shards import load_grasps
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, Seed
@@ -31,9 +30,7 @@ class Film(Command):
     grasps. The exit code is 1 if the object was not held.
     """
 
-    grasps: Path = positional(
-        "grasps.safetensors of `torchgrasp grasp`, or its folder, or a file of `evaluate`"
-    )
+    grasps: Path = positional(PLANNED_HELP)
     out: Path = required('file to write: .gif, or .mp4 (needs the extra "film", or ffmpeg)')
     hand: str | None = option(None, "name or folder of the hand; by default the name in the file")
     mesh: Path | None = option(
@@ -56,14 +53,12 @@ class Film(Command):
             check_kind(self.out)
         check_folder(self.out.parent)
         import_simulator(self.simulator)
-        file = self.grasps / GRASPS if self.grasps.is_dir() else self.grasps
-        with naming(path="GRASPS"):
-            planned = load_grasps(file)
+        planned, surface = load_planned(self.grasps)
         good = planned.executable
         if self.rank > len(good):
             allowed = f"at most {len(good)}, the number of executable grasps"
             raise BadArgument("--rank", self.rank, allowed)
-        mesh = file.with_name(SURFACE) if self.mesh is None else self.mesh
+        mesh = surface if self.mesh is None else self.mesh
         if self.mesh is None and not mesh.is_file():
             raise BadArgument("--mesh", None, f"a mesh where {mesh} is missing")
         with naming(name_or_path="--hand"):

@@ -52,6 +52,7 @@ from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.objects import take_target
+from torchgrasp.planner.request import Budget
 from torchgrasp.planner.scene_plan import plan_scene
 from torchgrasp.scene.file import scene_of
 from torchgrasp.scene.image import is_scene, read_arrays
@@ -66,7 +67,6 @@ from torchgrasp.values.specs import ContactSpec, Mode, TrialSpec
 Among = Literal["auto"] | None
 STAGES = ("shape", "plan", "certify", "query", "refine")
 """Stages of planning, as the planner reports them."""
-LEAST_BUDGET = 1e-3  # of --time-budget [s]
 DIGITS = 3  # decimals of a direction that is printed
 SHOWN = 5  # grasps that are printed
 OBJECT_WIDTHS = (-10, 7, -1)  # of the columns of a scene's objects
@@ -111,7 +111,7 @@ class Grasp(ForPrograms):
     )
     seed: Seed = option(0, "random seed; the same seed gives the same grasps")
     starts: Count = option(1000, inputs.STARTS_HELP)
-    time_budget: float | None = option(
+    time_budget: Budget | None = option(
         None, "seconds after which no batch of planning begins; by default no limit"
     )
     view: inputs.CloudOptions = nested(inputs.CloudOptions())
@@ -215,8 +215,6 @@ class Grasp(ForPrograms):
         elif self.label is not None or self.point is not None:
             wanted = "a .npz file with depth and intrinsics"
             raise BadArgument("--label, --point", f"{self.cloud}, which is no scene", wanted)
-        elif self.time_budget is not None and not self.time_budget >= LEAST_BUDGET:
-            raise BadArgument("--time-budget", self.time_budget, "at least 0.001 seconds")
 
     def _of_clouds_alone(self) -> list[str]:
         """Return the names of the given options that a scene does not take."""
@@ -245,15 +243,14 @@ class Grasp(ForPrograms):
             "--avoid": self.avoid is not None,
             "--time-budget": self.time_budget is not None,
         }
-        for name in (name for name, given in others.items() if given and self.edge is not None):
-            raise BadArgument("--edge", f"{name} beside it", "one of the two")
+        beside = [name for name, given in others.items() if given]
+        if self.edge is not None and beside:
+            raise BadArgument("--edge", f"{beside[0]} beside it", "one of the two")
 
     def _grasp_cloud(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
         """Plan on a point cloud and write the results; return the exit code."""
         mesh = self._true_mesh(path)
-        file = self.view.read("CLOUD", path)
-        file = inputs.without_exact_table(file, self.view.vertical)
-        view = self.view.with_table_of(file)
+        file, view = self.view.read_standing("CLOUD", path)
         cloud = file.cloud
         table = view.plane(cloud)
         if self.edge is not None:
@@ -287,18 +284,8 @@ class Grasp(ForPrograms):
                 shape = edge.shape
                 progress.values["plan"] = None  # the contacts where the object stood
                 cloud = move(cloud, rigid(torch.eye(3), drag.displacement).to(cloud.points))
-            run = make_run(
-                name,
-                path,
-                cloud,
-                hand,
-                spec,
-                grasps,
-                shape,
-                self._task["task"],
-                explanation=explanation,
-                **self._recorded(progress),
-            )
+            given = (name, path, cloud, hand, spec, grasps, shape, self._task["task"])
+            run = make_run(*given, explanation=explanation, **self._recorded(progress))
             if self.close and true_mesh is not None and len(run.executable):
                 run = self._close(run, edge, true_mesh, parts, plane, progress)
             progress.end("report", self._write(out, run))
@@ -323,8 +310,8 @@ class Grasp(ForPrograms):
         given = (source, hand, spec, self.starts, self.seed)
         options: dict[str, Any] = {"fingers": among, "mode": self.mode, "observer": progress.end}
         options |= self._task
-        grasps = plan_grasps(*given, **options, time_budget=self.time_budget or None)
-        if self.edge is not None or bool((grasps.status == Status.OK).any()):
+        grasps = plan_grasps(*given, **options, time_budget=self.time_budget)
+        if self.edge is not None or (grasps.status == Status.OK).any():
             return grasps, None
         return grasps, explain_empty(*given, **options)
 
@@ -475,19 +462,9 @@ class Grasp(ForPrograms):
             spec = dataclasses.replace(spec, table=scene.table)
             cloud = take_target(scene, self.seed)
             name = f"object {scene.target}"
-            run = make_run(
-                name,
-                path,
-                cloud,
-                hand,
-                spec,
-                grasps,
-                shape,
-                self._task["task"],
-                explanation=explanation,
-                scene=scene,
-                **self._recorded(progress),
-            )
+            given = (name, path, cloud, hand, spec, grasps, shape, self._task["task"])
+            known = {"explanation": explanation, "scene": scene}
+            run = make_run(*given, **known, **self._recorded(progress))
             progress.end("report", self._write(out, run))
             clear = ()
             if explanation is not None:

@@ -39,7 +39,7 @@ from torchgrasp.data.shipped import load_object
 from torchgrasp.files import format_columns, format_json, hold_file, render, write_file
 from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.errors import BadArgument, GraspError, OutputError, Status, one_line
-from torchgrasp.foundation.rules import Range, Seed
+from torchgrasp.foundation.rules import Range, Seed, check_suffix
 from torchgrasp.geometry.linalg import dot, norm
 from torchgrasp.hand.abilities import HandAbilities, hand_abilities, random_joints
 from torchgrasp.hand.hand import Hand
@@ -216,8 +216,7 @@ class HandCheck(ForPrograms):
 
         It is 2 for a hand with faults, 1 if no grasp passed all checks, else 0.
         """
-        if self.out.suffix.lower() != ".png":
-            raise BadArgument("--out", self.out, "a file ending in .png")
+        check_suffix("--out", self.out, ".png")
         chosen = "default" if self.fingers == "auto" else self.fingers
         with make_bar(None, "step", desc="faults") as bar:
             faults = list_faults(self.hand, chosen)
@@ -487,8 +486,8 @@ class HandTrain(Command):
 
     def run(self) -> int:
         """Sample postures, fit and evaluate the model, and write it; return the exit code 0."""
-        if self.out is not None and self.out.suffix != ".safetensors":
-            raise BadArgument("--out", self.out, "a file ending in .safetensors")
+        if self.out is not None:
+            check_suffix("--out", self.out, ".safetensors")
         hand = check_hand(self.hand)
         out = self.out or mixture_path(self.hand)
         with holding("--out", out, hold_file), holding("--checkpoint", self.checkpoint, hold_file):

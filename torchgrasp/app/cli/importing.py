@@ -16,7 +16,14 @@ from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, load_fingers
 from torchgrasp.cloud.agreement import check_contacts, check_seen
 from torchgrasp.cloud.read import read_cloud
 from torchgrasp.evaluation.touch import TOUCH, Touch, measure_touch
-from torchgrasp.export.foreign import POSE_NUMBERS, Quaternion, read_poses
+from torchgrasp.export.foreign import (
+    FARTHEST,
+    POSE_NUMBERS,
+    Quaternion,
+    check_places,
+    place_joints,
+    read_poses,
+)
 from torchgrasp.files import format_columns, format_json, write_file
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.lazy import trimesh
@@ -29,7 +36,6 @@ from torchgrasp.values.specs import ContactSpec
 Unit = Literal["m", "cm", "mm"]
 UNITS: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # [m]
 SHOWN = 20  # most grasps whose gaps are printed
-FARTHEST = 10  # of a hand from the object's frame [m]: farther is another unit
 
 
 @arguments(
@@ -103,8 +109,10 @@ class Import(Command):
         if surface is None and len(grasps):
             far = float(grasps.obj_from_hand[:, :3, 3].abs().max())
             if far > FARTHEST:
-                wanted = f"hands within {FARTHEST} m of the object's frame: --unit"
+                wanted = f"hands within {FARTHEST:g} m of the object's frame: --unit"
                 raise BadArgument("FILE", f"a hand {far:.0f} m off", wanted)
+        with naming(table="FILE"):
+            check_places(grasps)
         with naming(path="--out"):
             grasps.save(self.out)
         closed = int((grasps.status == Status.OK).sum())
@@ -142,7 +150,7 @@ class Import(Command):
             read = formats.read_foreign(self.file, hand, self.joints, quaternion, UNITS[unit], root)
         with naming(joints="FILE"):
             spec = ContactSpec(friction=self.friction, friction_margin=1.0)
-            return formats.grasps_from_joints(hand, *read, spec, self.std)
+            return place_joints(hand, *read, spec, self.std)
 
     def _check(self, hand: Hand, grasps: Grasps, surface: "trimesh.Trimesh | PointCloud") -> None:
         """Refuse grasps that are not on the object; the error names options that put them there,

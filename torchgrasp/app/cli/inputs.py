@@ -51,6 +51,19 @@ STARTS_HELP = "random initial guesses of the contact planner"
 SEED_HELP = "random seed"
 
 
+def read_up(up: tuple[float, float, float] | None) -> Tensor | None:
+    """Return the unit vector (3,) along the direction of --up; None for None.
+
+    Raises `BadArgument` for a direction of length zero, or one that is not finite.
+    """
+    if up is None:
+        return None
+    vector = check_tensor("--up", real(up), (3,))
+    if not vector.any():
+        raise BadArgument("--up", "a vector of length zero", "the direction that points up")
+    return unit(vector)
+
+
 @arguments()
 class ViewOptions:
     """Options for reading the file of a cloud: camera, normals, unit, vertical."""
@@ -81,12 +94,7 @@ class ViewOptions:
 
         Raises `BadArgument` for an --up of length zero.
         """
-        if self.up is None:
-            return None
-        vector = check_tensor("--up", real(self.up), (3,))
-        if not bool(vector.any()):
-            raise BadArgument("--up", "a vector of length zero", "the direction that points up")
-        return unit(vector)
+        return read_up(self.up)
 
     def read(self, name: str, path: Path, whole: bool = False) -> CloudFile:
         """Return the cloud [m] in the file at `path`, read as the options say.
@@ -158,6 +166,17 @@ class CloudOptions(ViewOptions):
             return self
         known: Any = {**vars(self), "table": (*file.table.normal.tolist(), file.table.offset)}
         return CloudOptions(**known)
+
+    def read_standing(
+        self, name: str, path: Path, whole: bool = False
+    ) -> "tuple[CloudFile, CloudOptions]":
+        """Return the cloud [m] in the file at `path` without its table, and these options with the
+        table that the file states.
+
+        The cloud is that of `read`. Points are left out that lie exactly in the plane of a table.
+        """
+        file = without_exact_table(self.read(name, path, whole), self.vertical)
+        return file, self.with_table_of(file)
 
     @property
     def given_table(self) -> Plane | float | None:
@@ -237,7 +256,7 @@ def read_table(table: tuple[float, ...]) -> Plane | float:
     if len(numbers) == 1:
         return float(numbers[0])
     length = norm(numbers[:3])
-    if not bool(length > 0):
+    if not length > 0:
         raise BadArgument("--table", "a normal of length zero", "the direction that points up")
     return Plane(numbers[:3] / length, float(numbers[3] / length))
 
@@ -258,7 +277,7 @@ def with_edge(table: Plane | float | None, edge: tuple[float, ...]) -> Plane:
         raise BadArgument("--edge", f"{len(edge)} numbers", wanted)
     numbers = check_tensor("--edge", real(edge), (len(edge),))
     point, outward = numbers.chunk(2)
-    if not bool(outward.any()):
+    if not outward.any():
         wanted = "the direction away from the table"
         raise BadArgument("--edge", "a direction of length zero", wanted)
     if len(edge) == 4:

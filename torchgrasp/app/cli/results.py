@@ -7,6 +7,7 @@ from typing import Any
 
 from torchgrasp.app.cli.command import naming
 from torchgrasp.app.report.run_data import Run, verdict
+from torchgrasp.data.shards import load_grasps
 from torchgrasp.data.shipped import DATA, list_objects, load_object
 from torchgrasp.export import save_surface
 from torchgrasp.export.play import stand
@@ -29,8 +30,19 @@ GRASPS = "grasps.safetensors"
 SURFACE = "surface.ply"
 REPORT = "report.html"
 """Names of the files that are written beside each other into a folder."""
+PLANNED_HELP = "grasps.safetensors of `torchgrasp grasp`, or its folder, or a file of `evaluate`"
 ENOUGH = 0.9  # predicted success of an object that is easy enough: the others are not tried
 HELPS = 0.8  # share of the deviation that may remain after a second view that is worth telling
+
+
+def load_planned(path: Path) -> tuple[Grasps, Path]:
+    """Return grasps of `torchgrasp grasp`, and the path of the surface that it wrote beside them.
+
+    `path` is that of their file or its folder. Errors name it GRASPS.
+    """
+    file = path / GRASPS if path.is_dir() else path
+    with naming(path="GRASPS"):
+        return load_grasps(file), file.with_name(SURFACE)
 
 
 def make_run(
