@@ -25,9 +25,10 @@ from torchgrasp import (
     stream_grasps,
 )
 from torchgrasp.contacts.critical import least_balance
+from torchgrasp.contacts.descent import Stage, project, start_state
 from torchgrasp.contacts.form_closure import closed_exact, maximise
 from torchgrasp.contacts.problem import ContactProblem
-from torchgrasp.contacts.solver import Stage, descend, project, start_state
+from torchgrasp.contacts.solver import descend
 from torchgrasp.foundation import fused
 from torchgrasp.foundation.base import Value, named_tensors
 from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance, MissingExtra
@@ -426,13 +427,6 @@ def test_gradients_go_through_operations_of_torch(shape, monkeypatch):
     torch.testing.assert_close(slope, gradient.detach())
 
 
-def test_an_import_brings_in_no_loops():
-    code = (
-        "import sys, torchgrasp; print(*(x for x in sys.modules if '.fused_' in x or x == 'numba'))"
-    )
-    assert run_python("-c", code).stdout.strip() == ""
-
-
 def import_file(path: Path):
     """The module of a file, as a new process finds it."""
     sys.modules.pop(path.stem, None)
@@ -463,22 +457,6 @@ def test_a_numba_that_cannot_be_imported_is_no_numba_that_is_missing(tmp_path, m
         fused.inlined(both)
 
 
-def test_compilation_of_loops_is_told_once_and_loading_is_silent(tmp_path, monkeypatch):
-    """A first plan that takes a minute more would look broken."""
-    pytest.importorskip("numba")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setenv(fused.VARIABLE, "1")
-    code = """if True:
-        import torch
-        from torchgrasp.geometry.linalg import farthest_points
-        points = torch.arange(24.0, dtype=torch.float64).view(8, 3)
-        farthest_points(points, 3)
-        farthest_points(points[:4], 3)
-    """
-    told = [run_python("-c", code).stderr.count("compiling loops, once") for _ in range(2)]
-    assert told == [1, 0]
-
-
 def test_loops_need_no_folder_for_machine_code():
     """A function that is in no file has none."""
     names = {}
@@ -486,17 +464,30 @@ def test_loops_need_no_folder_for_machine_code():
     assert fused.compiled(names["double"])(3.0) == 6
 
 
-def test_a_process_that_compiles_has_the_bits_of_one_that_loads(tmp_path, monkeypatch):
+PLAN = """if True:
+    import os, sys
+    import torchgrasp
+    print(*(x for x in sys.modules if ".fused_" in x or x == "numba"), "no loops")
+    from tests.test_fused import *
+    os.environ[fused.VARIABLE] = "0"
+    shape = fit_shape(load_object("jug").view, table=0.0)
+    points = project(shape, 0.5 * unit(random(50, 3, 3)), 6)
+    problem = ContactProblem.of(shape, ContactSpec(table=0.0))
+    state = start_state(shape, points)
+    os.environ[fused.VARIABLE] = "1"
+    farthest_points(points[0], 2)
+    print(descend(shape, problem, state, Stage(0.0, 3.0, 30, exact=False)).points.tolist())
+"""
+"""Two loops: the first is told, the second would be told again."""
+
+
+def test_a_process_that_compiles_says_so_once_and_has_the_bits_of_one_that_loads(
+    tmp_path, monkeypatch
+):
+    """A first plan that takes a minute more would look broken; an import brings in no loops."""
     pytest.importorskip("numba")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setenv(fused.VARIABLE, "1")
-    code = """if True:
-        from tests.test_fused import *
-        shape = fit_shape(load_object("jug").view, table=0.0)
-        points = project(shape, 0.5 * unit(random(50, 3, 3)), 6)
-        problem = ContactProblem.of(shape, ContactSpec(table=0.0))
-        state = start_state(shape, points)
-        print(descend(shape, problem, state, Stage(0.0, 3.0, 30, exact=False)).points.tolist())
-    """
-    first, second = (run_python("-c", code).stdout for _ in range(2))
-    assert first == second != ""
+    first, second = (run_python("-c", PLAN) for _ in range(2))
+    assert first.stdout == second.stdout and first.stdout.startswith("no loops\n[[[")
+    told = [said.stderr.count("compiling loops, once") for said in (first, second)]
+    assert told == [1, 0]

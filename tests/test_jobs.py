@@ -1,60 +1,19 @@
 """Worker processes that hang, die and raise; what a caller sees, and what is left behind."""
 
-import multiprocessing
-import os
 import pickle
 import signal
-import time
 
 import pytest
 import torch
 
 from tests.make import run_python
+from tests.tasks import Heavy, act, die_once, spin
 from torchgrasp.foundation.errors import BadArgument, NoWorkers, Status
 from torchgrasp.foundation.jobs import pack, run_as_they_end, run_tasks, unpack
 from torchgrasp.planner.schedule import BatchSize
 from torchgrasp.values.planning import PointCloud
 
 pytest.importorskip("pebble")
-
-
-def act(what: str, value: int = 0) -> object:
-    """Return a square, soon or later, hang or work without end, die in one of two ways, raise, or
-    report the threads.
-    """
-    if what == "hang":
-        time.sleep(600)
-    while what == "work":
-        pass
-    if what == "pause":
-        time.sleep(value / 1000)
-    if what == "slow":
-        time.sleep(0.3)
-    if what == "exit":
-        os._exit(3)
-    if what == "KILL":
-        os.kill(os.getpid(), signal.SIGKILL)
-    if what == "raise":
-        raise BadArgument("value", value, "another")
-    if what == "threads":
-        return torch.get_num_threads()
-    return value * value
-
-
-def spin(seconds: float, value: int) -> int:
-    """Return the value after a processor time [s]."""
-    started = time.process_time()
-    while time.process_time() < started + seconds:
-        pass
-    return value
-
-
-def die_once(path: str) -> str:
-    """Die at the first call, and leave a file that tells the second."""
-    if not os.path.exists(path):
-        open(path, "w").close()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return "survived"
 
 
 @pytest.mark.promise("F5")
@@ -115,25 +74,6 @@ def test_here_a_task_has_one_thread_and_the_caller_its_own():
             assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
-
-
-class Heavy:
-    """A task whose workers die while they begin, as many times as the folder has no mark."""
-
-    def __init__(self, folder: str, deaths: int) -> None:
-        self.folder = folder
-        self.deaths = deaths
-
-    def __call__(self, value: int) -> int:
-        return value * value
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        self.__dict__ |= state
-        if multiprocessing.parent_process() is not None:
-            number = len(os.listdir(self.folder))
-            if number < self.deaths:
-                open(os.path.join(self.folder, str(number)), "w").close()
-                os._exit(7)
 
 
 @pytest.mark.promise("F4")

@@ -18,10 +18,12 @@ import pytest
 from nbclient import NotebookClient
 from PIL import Image
 
+from tests.make import HALF, halved
 from tests.pinch import QUICK
 from torchgrasp import TrialSpec
 from torchgrasp.app.cli.hands import HandTrial
 from torchgrasp.evaluation import PROTOCOLS
+from torchgrasp.hand.collision_shapes import collision_pairs
 
 pytestmark = pytest.mark.usefixtures("kept_plans")
 ROOT = Path(__file__).parents[1]
@@ -35,9 +37,13 @@ def fenced(language, text=README):
 
 
 def with_little_work(code, most=8):
-    """Return code whose plans have few starts, with few steps of descent and one trial of a view."""
+    """Return code whose plans have few starts, with few steps of descent, one trial of a view, and
+    few ticks of a controller.
+    """
     code = re.sub(r"starts=(\d+)", lambda found: f"starts={min(int(found[1]), most)}", code)
+    code = re.sub(r"1 / [12]00\b", "1 / 50", code)
     code = code.replace("range(300)", "range(10)").replace("grasps=2,", "grasps=1,")
+    code = code.replace("for shift in (0.0, 0.02):", "for shift in (0.0,):")
     code = code.replace("task=GraspTask(mass=mass))", f"task=GraspTask(mass=mass), starts={most})")
     return code
 
@@ -93,6 +99,8 @@ def test_the_guide_to_hands_runs_as_it_stands(
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL", HandTrial(starts=4, postures=1000))
     monkeypatch.setattr("torchgrasp.app.cli.hands.draw_hand", lambda *hand: b"")
+    few = functools.partial(collision_pairs, n=2000)
+    monkeypatch.setattr("torchgrasp.app.author.draft.collision_pairs", few)
     monkeypatch.setattr("torchgrasp.app.report.page.draw_pictures", lambda run: {})
     guide = "".join(fenced("bash", (ROOT / "docs" / "hands.md").read_text())).replace(
         "--starts 200", "--starts 8"
@@ -119,10 +127,21 @@ def test_the_guide_to_hands_runs_as_it_stands(
 
 
 def test_the_guide_to_a_real_camera_runs_as_it_stands(tmp_path, monkeypatch, capsys):
-    """The commands take the frame that the page renders; planning itself is replaced."""
+    """The commands take the frame that the page renders, in a quarter of the pixels; planning itself
+    is replaced.
+    """
     from torchgrasp import read_scene
     from torchgrasp.app import cli
     from torchgrasp.app.cli.grasp import Grasp
+    from torchgrasp.cloud import camera
+
+    def render_less(*given, **options):
+        depth, labels = render_whole(*given, **options)
+        return halved(depth), halved(labels)
+
+    render_whole = camera.render_depth
+    monkeypatch.setattr(camera, "render_depth", render_less)
+    monkeypatch.setattr(camera, "INTRINSICS", HALF)
 
     guide = (ROOT / "docs" / "real_camera.md").read_text()
     found = []

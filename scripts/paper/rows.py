@@ -79,17 +79,16 @@ class TableSpec(Value):
 
 
 class Subject(NamedTuple):
-    """An object of a campaign: its folder (None for the library's own), name, family and group."""
+    """An object of a campaign: its folder (None for the library's own), name, family and group.
+
+    `label` is its name in results and their files, which no other object of the campaign has.
+    """
 
     folder: Path | None
     name: str
     family: str
     group: str
-
-    @property
-    def label(self) -> str:
-        """The name of the object in results; "own NAME" for the library's own objects."""
-        return f"own {self.name}" if self.folder is None else self.name
+    label: str
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -24,7 +25,7 @@ from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.protocols import draw_error, seed_of
 from torchgrasp.files import format_json, write_file
-from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.foundation.errors import BadArgument, GraspError, Status
 from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -70,15 +71,19 @@ def run_cells(spec: TableSpec, rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]
 def subjects(spec: TableSpec) -> list[Subject]:
     """Return the objects of a campaign: first one of each family, the families in random order.
 
-    So the objects that are finished when a campaign is stopped are a fair sample of all.
+    So the objects that are finished when a campaign is stopped are a fair sample of all. Equal
+    names of two folders get the name of the folder. Raises `BadArgument` if that is equal, too.
     """
-    found = [Subject(None, name, f"own {name}", "") for name in list_objects() if spec.own]
+    own = list_objects() if spec.own else ()
+    found = [Subject(None, name, f"own {name}", "", f"own {name}") for name in own]
     for folder in spec.objects:
         names = dict.fromkeys(name for name, _ in list_views(folder))
         entries = {name: read_entry(folder, name) for name in names}
         found += [
-            Subject(folder, name, entry.family, entry.group) for name, entry in entries.items()
+            Subject(folder, name, entry.family, entry.group, name)
+            for name, entry in entries.items()
         ]
+    found = _with_own_labels(found)
     kept = [subject for subject in found if not spec.only or subject.name in spec.only]
     families: dict[str, list[Subject]] = {}
     for subject in sorted(kept, key=lambda x: x.label):
@@ -86,6 +91,21 @@ def subjects(spec: TableSpec) -> list[Subject]:
     ranked = [(k, subject) for some in families.values() for k, subject in enumerate(some)]
     ranked.sort(key=lambda x: (x[0], seed_of(spec.seed, x[1].label)))
     return [subject for k, subject in ranked if not (spec.representatives and k)]
+
+
+def _with_own_labels(subjects: list[Subject]) -> list[Subject]:
+    """Return the objects with labels of their own: equal ones get the name of their folder."""
+    times = Counter(subject.label for subject in subjects)
+    found = list[Subject]()
+    for subject in subjects:
+        if times[subject.label] > 1 and subject.folder is not None:
+            folder = subject.folder.resolve().name
+            subject = subject._replace(label=f"{subject.name} of {folder}")
+        found.append(subject)
+    (label, count), *_ = Counter(subject.label for subject in found).most_common(1) or [("", 0)]
+    if count > 1:
+        raise BadArgument("objects", f"{label} {count} times", "folders of different names")
+    return found
 
 
 def fill(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from torchgrasp.app import cli
+from torchgrasp.hand.collision_shapes import collision_pairs
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hands_folder, load_hand
 
@@ -27,6 +28,21 @@ def plans_once(kept_plans: None) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("torchgrasp.app.cli.inputs.load_hand", load_shipped_once)
         yield
+
+
+@pytest.fixture
+def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Find the pairs of links that can collide in fewer random postures, which take most of the time
+    of a draft.
+    """
+    few = functools.partial(collision_pairs, n=2000)
+    monkeypatch.setattr("torchgrasp.app.author.draft.collision_pairs", few)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write an empty picture of a hand, which takes as long to draw as all checks of the hand."""
+    monkeypatch.setattr("torchgrasp.app.cli.hands.draw_hand", lambda *hand: b"")
 
 
 @pytest.fixture

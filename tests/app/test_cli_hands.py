@@ -26,7 +26,7 @@ def barrett(tmp_path):
 
 
 @pytest.fixture(autouse=True)
-def few_starts(monkeypatch, few_postures):
+def few_starts(monkeypatch, few_postures, few_draws):
     """Try a hand with little work."""
     monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL", HandTrial(starts=4, postures=1000))
 
@@ -134,7 +134,7 @@ def test_new_adds_sensor_tips_that_the_file_lacks(claw, run_command, refusal, tm
     assert told.startswith("--tip-offset: ") and not (tmp_path / "no").exists()
 
 
-def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_path):
+def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_path, undrawn):
     """A mesh as a tip: the clean copy lies beside the URDF, under another name, or in a folder of
     its own.
     """
@@ -173,7 +173,7 @@ def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_pat
     assert "the hand can grasp" in capsys.readouterr().out
 
 
-def test_hand_check_prints_warnings_with_their_fixes(claw, capsys, monkeypatch):
+def test_hand_check_prints_warnings_with_their_fixes(claw, capsys, monkeypatch, undrawn):
     """A pad that faces away, and a link that is always in another's way."""
     text = claw.read_text().replace(
         '<box size="0.016 0.02 0.056"/>', '<box size="0.055 0.055 0.056"/>'
@@ -193,7 +193,7 @@ def test_hand_check_prints_warnings_with_their_fixes(claw, capsys, monkeypatch):
     assert "warning: default: only" in said and "warning: default: the pad of left faces" in said
 
 
-def test_every_set_of_fingers_is_checked_and_tried(tmp_path, capsys, monkeypatch):
+def test_every_set_of_fingers_is_checked_and_tried(tmp_path, capsys, monkeypatch, undrawn):
     """A draft of the Allegro hand has two; a fault of a further one is named, and four fingers are
     described.
     """

@@ -132,9 +132,36 @@ def test_views_to_which_one_pose_was_given_are_told():
     with pytest.warns(CloudWarning, match="clouds 0 and 1 were seen from one place"):
         merge_clouds([first, second], [poses[0], poses[0]])
     assert len(merge_clouds([first, first], [poses[0], poses[0]])) == 1200
-    # cameras that are guessed tell nothing
+    # cameras that are guessed tell nothing about a place
     nowhere = PointCloud(first.points)
-    assert len(merge_clouds([nowhere, nowhere], [EYE, EYE])) == 1200
+    with pytest.warns(CloudWarning, match=r"clouds: the cameras of \[0, 1\] are guessed") as told:
+        assert len(merge_clouds([nowhere, nowhere], [EYE, EYE])) == 1200
+    assert len(told) == 1
+
+
+def test_a_guessed_camera_is_told_where_it_counts_as_given(two_views):
+    first, second = two_views
+    unknown = PointCloud(second.points)
+    with pytest.warns(CloudWarning, match=r"clouds: the cameras of \[1\] are guessed.*viewpoint"):
+        merge_clouds([first, unknown], [EYE, EYE])
+    # a surface whose normals are known needs no camera
+    surface = clean_cloud(second)
+    surface = PointCloud(surface.points, surface.normals)
+    assert merge_clouds([first, surface], [EYE, EYE]).viewpoint is None
+
+
+def test_two_views_that_were_given_each_other_s_pose_are_refused():
+    mesh = load_object("jug").mesh
+    poses = [look_at(azimuth, 40.0, 0.6, mesh).double() for azimuth in (0.0, 60.0)]
+    views = [partial_view(mesh, pose, n=700) for pose in poses]
+    camera = torch.zeros(3, dtype=torch.float64)
+    own = [
+        PointCloud(apply(inverse(pose), view.points), None, camera)
+        for view, pose in zip(views, poses, strict=True)
+    ]
+    assert len(merge_clouds(own, poses)) == 1400
+    with pytest.raises(BadArgument, match="expected views of one object that agree"):
+        merge_clouds(own, poses[::-1])
 
 
 def around(mesh, azimuths, noise="realsense"):
@@ -213,6 +240,7 @@ def test_the_distance_of_views_is_that_of_their_surfaces():
         assert stated_distances(error)[0] == pytest.approx(1e3 * metres, rel=0.35)
 
 
+@pytest.mark.filterwarnings("ignore:clouds. the cameras of")
 def test_views_without_cameras_are_compared_where_they_overlap():
     mesh = load_object("jug").mesh
     views = [PointCloud(view.points) for view in around(mesh, (0.0, 70.0))]

@@ -262,14 +262,22 @@ def test_a_view_faces_its_camera_and_a_whole_surface_does_not(name):
     )
 
 
-@pytest.mark.parametrize("name", list_objects())
-def test_normals_to_the_middle_are_told_where_no_camera_shows_their_side(name):
+def outward(name: str) -> tuple[PointCloud, PointCloud]:
+    """Return a view and the whole surface of an object, both with normals that point outward."""
     seen = estimate_normals(load_object(name).view)
-    whole = surface(load_object(name).mesh, 1500)
-    for cloud in (PointCloud(seen.points, seen.normals), whole):
-        inward = PointCloud(cloud.points, -cloud.normals)
+    return PointCloud(seen.points, seen.normals), surface(load_object(name).mesh, 1500)
+
+
+@pytest.mark.parametrize("name", list_objects())
+def test_normals_to_the_middle_are_noticed(name):
+    for cloud in outward(name):
         assert not point_inward(cloud.points, cloud.normals)
-        assert point_inward(inward.points, inward.normals)
+        assert point_inward(cloud.points, -cloud.normals)
+
+
+def test_normals_to_the_middle_are_told_where_no_camera_shows_their_side():
+    for cloud in outward("jug"):
+        inward = PointCloud(cloud.points, -cloud.normals)
         assert not any("to the middle" in str(x) for x in diagnose_cloud(cloud).advice)
         (said,) = [x for x in diagnose_cloud(inward).advice if "to the middle" in str(x)]
         assert not said.refused and "--no-normals" in said.fix

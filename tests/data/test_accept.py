@@ -3,6 +3,7 @@ careful caller makes.
 """
 
 import types
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,12 @@ from torchgrasp import cloud_from_array, load_hand, load_object, save_scene
 from torchgrasp.cloud import save_cloud
 from torchgrasp.cloud.neighbours import fit_local_planes
 from torchgrasp.data import load_shipped_grasp
-from torchgrasp.data.accept import as_cloud, as_hand, as_seen
+from torchgrasp.data.accept import CloudLike, as_cloud, as_hand, as_seen
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.values.planning import PointCloud
+from torchgrasp.values.specs import ContactSpec
 
 VIEW = load_object("cylinder").view
 ARRAY = VIEW.points.numpy()
@@ -52,6 +56,29 @@ def test_the_table_of_a_file_is_told_where_it_is_not_read(tmp_path):
     path = save_cloud(VIEW, tmp_path / "a.npz", Plane.horizontal(0.02))
     with pytest.warns(NoEffect, match="its table, normal 0 0 1, offset 0.02.* give it"):
         assert torch.equal(as_cloud(path, "cloud").points, VIEW.points)
+    with pytest.warns(NoEffect, match="its table"):
+        assert read_beside(path).points.shape == VIEW.points.shape
+
+
+def test_the_table_of_a_file_is_not_told_to_who_gives_a_table(tmp_path):
+    path = save_cloud(VIEW, tmp_path / "a.npz", Plane.horizontal(0.02))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_beside(path, table=0.02)
+        read_beside(path, spec=ContactSpec(table=0.02))
+    with pytest.warns(NoEffect, match="its table"):
+        read_beside(path, spec=ContactSpec())
+    # an earlier call says nothing about this one
+    with pytest.warns(NoEffect, match="its table"):
+        as_cloud(path, "cloud")
+
+
+@checked
+def read_beside(
+    cloud: CloudLike, table: float | None = None, spec: ContactSpec | None = None
+) -> PointCloud:
+    """Return the cloud that a function would get, beside its table and its spec."""
+    return as_cloud(cloud, "cloud")
 
 
 def test_normals_of_open3d_and_of_six_columns_are_kept():

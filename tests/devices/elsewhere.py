@@ -52,6 +52,10 @@ COPIES = {"tolist", "__repr__", "__format__"}
 """Functions that copy a whole tensor to the host."""
 NUMBERS = {torch.Size, torch.dtype, bool, int, float}
 """Types of results without tensors."""
+TOLD = {*INTO, "copy_", "new_tensor"}
+"""Functions that may copy numbers to the device."""
+PLACES = torch.device, str
+SERIES = list, tuple
 DEVICE_OF = Tensor.device.__get__
 IS_CUDA = Tensor.is_cuda.__get__
 HOST_ONLY = Tensor.numpy, Tensor.__array__
@@ -94,7 +98,7 @@ def elsewhere(value: Tensor) -> Tensor:
 
 def _home(value: Any) -> Any:
     """Return a device argument as the CPU's, if it names the pretended device."""
-    if not isinstance(value, torch.device | str):
+    if not isinstance(value, PLACES):
         return value
     return torch.device("cpu") if str(value).split(":")[0] == DEVICE.type else value
 
@@ -123,7 +127,7 @@ def _tensors(values: Any) -> list[Tensor]:
     for value in values:
         if isinstance(value, Tensor):
             found.append(value)
-        elif isinstance(value, list | tuple):
+        elif isinstance(value, SERIES):
             found += _tensors(value)
         elif isinstance(value, dict):
             found += _tensors(value.values())
@@ -137,7 +141,7 @@ def _device(value: Tensor) -> torch.device:
 def _target(arguments: list[Any]) -> torch.device | None:
     """Return the device that `Tensor.to` is asked for."""
     for value in arguments:
-        if isinstance(value, torch.device | str):
+        if isinstance(value, PLACES):
             return torch.device(value)
         if isinstance(value, Tensor):
             return _device(value)
@@ -175,13 +179,23 @@ class Elsewhere(Tensor):
                     return func(*args, **kwargs)
                 if func is Tensor.__deepcopy__:
                     return elsewhere(args[0])
-                _refuse_mixes(func, name, args, kwargs)
-                _tell_uploads(name, args)
+                # nothing is mixed in most calls
+                alike = not kwargs and ALIKE.issuperset(map(type, args))
+                if not alike:
+                    _refuse_mixes(func, name, args, kwargs)
+                if name in TOLD:
+                    _tell_uploads(name, args)
+                if alike:
+                    return _moved(func(*args))
                 result = func(*map(_home, args), **(kwargs and _all_home(kwargs)))
             finally:
                 TRAFFIC.running -= 1
         stays = kwargs.get("device") is not None and torch.device(kwargs["device"]).type == "cpu"
         return result if stays else _moved(result)
+
+
+ALIKE = {Elsewhere, *NUMBERS}
+"""Types of arguments without a tensor of the CPU."""
 
 
 @contextlib.contextmanager
@@ -243,8 +257,6 @@ def _convert(target: torch.device, args: Any, kwargs: dict[str, Any]) -> Tensor:
 
 def _refuse_mixes(func: Any, name: str, args: Any, kwargs: dict[str, Any]) -> None:
     """Raise what a GPU raises for tensors of both devices, except where it takes them."""
-    if not kwargs and all(type(x) is Elsewhere or type(x) in NUMBERS for x in args):
-        return
     tensors = _tensors([*args, *kwargs.values()])
     there = any(isinstance(x, Elsewhere) for x in tensors)
     generator = kwargs.get("generator")

@@ -28,7 +28,7 @@ from torchgrasp.evaluation.protocols import (
     find_protocol,
     seed_of,
 )
-from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth, check_truth
 from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
@@ -49,6 +49,10 @@ def test_motions_in_degrees_and_millimetres_are_refused():
             PullSpec(10.0, 2.0, distance, math.inf)
         with pytest.raises(BadArgument, match=r"translation: expected a number in \[0, 0\.5\]"):
             PoseNoise(distance)
+    for angle in (1.0, 3.0, 5.0):
+        with pytest.raises(BadArgument, match=r"rotation: expected .* rad, not in degrees"):
+            PoseNoise(0.005, angle)
+    assert PoseNoise(0.005, math.radians(45)).rotation == math.pi / 4
 
 
 def test_errors_of_the_pose_stay_within_the_protocol_s():
@@ -191,6 +195,22 @@ def test_a_protocol_plans_for_the_distributions_that_its_trials_draw_from():
         TrialSpec(friction=Distribution.between(0.3, 0.8), table_friction=0.4)
 
 
+def test_truths_in_millimetres_or_under_their_table_are_refused():
+    """A failed trial would be the grasp's fault."""
+    hand, grasp = pinch("allegro")
+    mesh = cylinder()
+    with pytest.raises(BadArgument, match=r"slide: expected at most .* m, in metres, got .* 30 m"):
+        Truth(mesh, slide=real([30.0, 0.0, 0.0]))
+    aside = torch.eye(4).double()
+    aside[0, 3] = 5.0
+    with pytest.raises(BadArgument, match=r"error: expected at most 2 m, in metres"):
+        Truth(mesh, error=aside)
+    above = Truth(mesh, table=Plane.horizontal(0.5))
+    with pytest.raises(BadArgument, match=r"table: expected the true table below the object"):
+        check_truth(GraspTrial(hand, grasp, above))
+    check_truth(GraspTrial(hand, grasp, Truth(mesh, table=Plane.horizontal(0.0))))
+
+
 def test_what_a_trial_would_ignore_is_refused_or_told(monkeypatch):
     monkeypatch.setattr(TrialDriver, "_scene_spec", lambda *given: None)  # the scene is not built
     hand, grasp = pinch("allegro")
@@ -200,6 +220,9 @@ def test_what_a_trial_would_ignore_is_refused_or_told(monkeypatch):
     TrialDriver(GraspTrial(hand, grasp, slides), TrialSpec())
     with pytest.raises(BadArgument, match=r"slide: .*approach"):
         TrialDriver(GraspTrial(hand, grasp, slides), TrialSpec(approach=0.0))
+    rises = dataclasses.replace(still, slide=real([0.01, 0.0, 0.03]))
+    with pytest.raises(BadArgument, match=r"slide: expected one along the table.* got .* 30 mm"):
+        TrialDriver(GraspTrial(hand, grasp, rises), TrialSpec())
     told = Plane.horizontal(0.0)
     with pytest.raises(BadArgument, match="told: "):
         TrialDriver(GraspTrial(hand, grasp, still, told=told), TrialSpec(table=False))

@@ -263,6 +263,7 @@ def test_the_command_writes_numbers_and_a_page(folder, tmp_path, capsys, monkeyp
         "--out",
         str(tmp_path / "out"),
     ]
+    words += ["--workers", "0"]
     assert cli.main([*words, "--grasps", "2", "--starts", "6"]) == 0
     written = json.loads(
         (tmp_path / "out" / "evaluate.json").read_text(), parse_constant=pytest.fail
@@ -285,8 +286,6 @@ def test_the_command_writes_numbers_and_a_page(folder, tmp_path, capsys, monkeyp
                 "1",
                 "--planned",
                 str(tmp_path / "out" / "grasps"),
-                "--workers",
-                "0",
             ]
         )
         == 0
@@ -374,6 +373,22 @@ def test_objects_of_the_household_protocol_have_the_masses_of_the_manifest(
     assert [trial.mass for trial in tried] == [0.7, 0.2, 0.1]
     assert PROTOCOLS["multidex"].with_trial(mass=0.2).trial.density is None
     assert PROTOCOLS["multidex"].with_trial(friction=0.2).trial.density == 500.0
+
+
+def test_an_object_whose_mass_no_trial_takes_is_refused_before_it_is_planned(folder, tmp_path):
+    """A mass in grams would end the evaluation of all objects at the first trial of this one."""
+    objects = tmp_path / "objects"
+    shutil.copytree(folder, objects)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["objects"]["tin"]["mass_kg"] = 250
+    (objects / "manifest.json").write_text(json.dumps(manifest))
+    view = views.ObjectView(objects, "tin", "view0", load_hand("barrett").source)
+    household = PROTOCOLS["household"]
+    score, cloud, grasps = views.plan_view(view, household, EvaluationSpec(1))
+    assert score.refusal is Status.BAD_OBJECT and cloud is None and grasps is None
+    assert "mass_kg: expected 0.001 to 10 kg for 'household', got 250" in score.note
+    # a protocol of another mass does not ask
+    assert views._of_object(view, PROTOCOLS["tabletop"]) is PROTOCOLS["tabletop"]
 
 
 def test_a_mesh_that_changes_between_two_calls_is_read_again(folder, tmp_path):

@@ -90,6 +90,19 @@ def test_a_mesh_inside_out_or_in_millimetres_is_refused_and_an_open_one_is_not()
     torch.testing.assert_close(near, truth.gaps, atol=1e-6, rtol=0)
 
 
+def test_an_object_in_another_frame_is_refused_and_one_that_is_missed_is_not():
+    hand, grasp = pinch("barrett")
+    body = cylinder()
+    missed = body.copy().apply_translation([0.3, 0.0, 0.0])
+    assert measure_touch(hand, grasp, missed).verdicts == ["apart"]
+    for surface in (
+        body.copy().apply_translation([0.0, 0.0, 1.0]),
+        PointCloud(torch.from_numpy(body.vertices + 5.0)),
+    ):
+        with pytest.raises(BadArgument, match="surface: expected the grasped object"):
+            measure_touch(hand, grasp, surface)
+
+
 @pytest.mark.parametrize(
     ("gap", "verdict"),
     [(0.002, "touches"), (-0.002, "touches"), (0.004, "apart"), (-0.004, "penetrates")],

@@ -247,10 +247,32 @@ def test_the_command_takes_names_a_file_of_names_and_a_flange(tmp_path, capsys):
 def test_a_time_just_below_a_second_has_valid_nanoseconds():
     """The message allows less than 1e9 of them."""
     times = torch.tensor([0.0, 0.25, 1.9999999999], dtype=torch.float64)
-    motion = ArmMotion(("a",), times, torch.zeros(1, 3, 1).double(), {"above": 0})
-    points = yaml.safe_load(format_motion(pinch("barrett")[0], motion))["points"]
+    hand = pinch("barrett")[0]
+    motion = ArmMotion(hand.tree.joint_names, times, torch.zeros(1, 3, 8).double(), {"above": 0})
+    points = yaml.safe_load(format_motion(hand, motion))["points"]
     assert [point["time_from_start"] for point in points] == [
         {"sec": 0, "nanosec": 0},
         {"sec": 0, "nanosec": 250_000_000},
         {"sec": 2, "nanosec": 0},
     ]
+
+
+def test_a_motion_of_another_hand_is_refused():
+    """Equal numbers of joints, or equal names of joints, do not make two hands one."""
+    hand = pinch("barrett")[0]
+    names = ("arm", *hand.tree.joint_names)
+    times = torch.tensor([0.0, 1.0])
+    still = torch.zeros(1, 2, len(names))
+    assert "arm" in format_motion(hand, ArmMotion(names, times, still, {"above": 0}))
+    for other in (names[::-1], ("arm", *(f"joint_{k}" for k in range(8))), names[:-1]):
+        motion = ArmMotion(other, times, still[..., : len(other)], {"above": 0})
+        with pytest.raises(BadArgument, match="motion: expected those of the hand: "):
+            format_motion(hand, motion)
+    with pytest.raises(BadArgument, match="motion: expected those of the hand: "):
+        format_motion(pinch("allegro")[0], ArmMotion(names, times, still, {"above": 0}))
+    # a posture that the hand cannot have; the targets that press may be beyond the limits
+    beyond = still.clone()
+    beyond[:, 1] = 9.0
+    assert format_motion(hand, ArmMotion(names, times, beyond, {"above": 0, "squeeze": 1}))
+    with pytest.raises(BadArgument, match=r"motion\.positions: .* got 9 for spread"):
+        format_motion(hand, ArmMotion(names, times, beyond, {"above": 0, "grasp": 1}))

@@ -29,6 +29,7 @@ from torchgrasp.export import (
     save_play,
 )
 from torchgrasp.foundation.errors import BadArgument, GraspFileWarning, ModelFileError, Status
+from torchgrasp.geometry.plane import Plane
 
 yaml = pytest.importorskip("yaml")
 
@@ -253,6 +254,22 @@ def test_grasps_of_joints_alone_have_contacts_certificates_and_a_pregrasp(name):
     assert bool(((opened * outward).sum(-1) > (0.01 if name == "allegro" else 0.001)).all())
     squeezed = squeeze(hand, grasps, 4.0)
     assert bool(torch.isfinite(squeezed.joints).all())
+
+
+def test_joints_with_poses_in_millimetres_or_an_impossible_table_are_refused():
+    hand, planned = pinch("barrett")
+    joints = planned.joints
+    pose = planned.obj_from_hand
+    far = pose.clone()
+    far[:, :3, 3] *= 1000
+    with pytest.raises(BadArgument, match="obj_from_hand: expected poses within 10 m, in metres"):
+        grasps_from_joints(hand, joints, far)
+    assert len(grasps_from_joints(hand, joints, pose, table=Plane.horizontal(0.0))) == 1
+    down = Plane(torch.tensor([0.0, 0.0, -1.0]), 0.0)
+    for table in (Plane.horizontal(0.5), Plane.horizontal(-150.0), down):
+        with pytest.raises(BadArgument, match="table: expected the table under the object"):
+            grasps_from_joints(hand, joints, pose, table=table)
+    assert len(grasps_from_joints(hand, joints[:0], pose[:0], table=down)) == 0
 
 
 def test_our_json_and_dexgraspbench_come_back_to_the_same_grasps(tmp_path):

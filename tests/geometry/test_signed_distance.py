@@ -109,6 +109,19 @@ def test_bad_surfaces_are_named():
         field_from_surface(vertices, torch.tensor([[0, 1, 2]]), spacing=0.001)
 
 
+def test_a_field_without_cells_is_refused():
+    """Between mirrored nodes, or along an axis of one node, there is nothing to interpolate."""
+    origin = real([0.0, 0.0, 0.0])
+    for spacing, shape, named in (
+        (-0.1, (2, 2, 2), "spacing"),
+        (0.0, (2, 2, 2), "spacing"),
+        (0.1, (2, 1, 2), "values"),
+        (0.1, (0, 2, 2), "values"),
+    ):
+        with pytest.raises(BadArgument, match=f"{named}: expected"):
+            SignedDistanceField(origin, spacing, torch.ones(shape).double())
+
+
 def test_every_row_of_joined_fields_has_the_distances_of_its_own_field(generator):
     shapes = ((9, 7, 8), (5, 12, 6), (8, 8, 8))
     fields = list[SignedDistanceField]()

@@ -12,6 +12,8 @@ from torchgrasp.geometry.frames import rotation_from_vector
 from torchgrasp.hand.collision_shapes import (
     MEETING_DISTANCE,
     collision_pairs,
+    draw_postures,
+    met_pairs,
     self_collision_from_urdf,
 )
 from torchgrasp.hand.hand_toml import read_hand_toml
@@ -129,6 +131,18 @@ def test_pairs_of_the_shipped_hands_are_the_learned_ones(name):
     assert list(spec.pairs) == sorted(
         spec.pairs, key=lambda pair: [hand.tree.link_names.index(x) for x in pair]
     )
+
+
+def test_a_pair_that_is_named_twice_meets_twice():
+    hand = load_hand("barrett")
+    urdf = read_urdf(hand.urdf_path)
+    spec = read_hand_toml(hand.urdf_path.parent / "hand.toml")
+    assert spec.pairs is not None
+    postures = draw_postures(urdf, spec.coupling, 200, seed=0)
+    once = met_pairs(urdf, spec.pairs, postures)
+    assert bool(once.any())
+    twice = [*spec.pairs, *((b, a) for a, b in spec.pairs)]
+    assert torch.equal(met_pairs(urdf, twice, postures), torch.cat([once, once]))
 
 
 def test_links_that_always_or_never_meet_are_no_pairs_and_a_hand_without_any_is_always_clear(

@@ -40,7 +40,7 @@ from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.ik import GraspProblem, PostureLibrary
 from torchgrasp.planner import DragPlan
 from torchgrasp.planner.explain import Funnel, Losses
-from torchgrasp.posture_model import GaussianMixture, SampleSpec, write_samples
+from torchgrasp.posture_model import GaussianMixture, HandSamples, SampleSpec, write_samples
 from torchgrasp.posture_model.dataset import SampleFolder
 from torchgrasp.posture_model.mixture import CODE_NAMES
 from torchgrasp.shape import Kernel, thin_plate_kernel
@@ -97,6 +97,7 @@ def special(kind: type) -> Any:
         SampleFolder: lambda: write_samples(
             special(torchgrasp.Hand), SampleSpec(20), tempfile.mkdtemp()
         ),
+        HandSamples: hand_samples,
         Completion: lambda: complete_cloud(estimate_normals(special(PointCloud))),
         Outlines: lambda: silhouettes(special(PointCloud)),
         Silhouette: lambda: special(Outlines).views[0],
@@ -133,6 +134,11 @@ def special(kind: type) -> Any:
 def few_points() -> PointCloud:
     view = load_object("cylinder").view
     return PointCloud(view.points[:150], None, view.viewpoint)
+
+
+def hand_samples() -> HandSamples:
+    numbers = torch.rand(60, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return HandSamples(numbers[:, :1], numbers[:, 1:], ("j",))
 
 
 def impedance() -> Impedance:

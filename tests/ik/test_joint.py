@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from torchgrasp import Status, certify
+from torchgrasp.contacts.descent import normalise_tensions
 from torchgrasp.contacts.feasibility import flatness_constraint
 from torchgrasp.contacts.problem import ContactProblem, triple_jet
-from torchgrasp.contacts.solver import normalise_tensions
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 from torchgrasp.ik.attempts import assign, solve_contact_first
@@ -46,6 +46,14 @@ def test_guesses_of_another_hand_or_of_other_contact_sets_are_refused(scene):
     for wrong, found in ((fewer_joints, "joints"), (beyond, "contact set")):
         with pytest.raises(BadArgument, match=rf"seeds: expected .*{found}"):
             solve_joint(given, wrong, shape, spec)
+
+
+def test_a_centre_in_millimetres_is_refused(scene):
+    """It would rank the grasps alone, by a distance that has no meaning."""
+    given = scene[0]
+    assert dataclasses.replace(given, center=given.center + 0.1) is not given
+    with pytest.raises(BadArgument, match="center: expected one within 2 m, in metres"):
+        dataclasses.replace(given, center=1000 * (given.center + 0.1))
 
 
 def test_jacobian_of_the_joint_problem_against_finite_differences(scene, generator):

@@ -7,11 +7,18 @@ import torch
 
 from tests.make import distance_field, field_of_mesh
 from tests.pinch import HEIGHT, RADIUS, cylinder, pinch
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
-from torchgrasp.ik.motion import APPROACH_DISTANCE, FINE_STEPS, approach_directions, find_approach
+from torchgrasp.ik.motion import (
+    APPROACH_DISTANCE,
+    FINE_STEPS,
+    approach_directions,
+    find_approach,
+    opened_pose,
+)
 
 
 def spheres_on_path(posture, hand, direction, places=81):
@@ -143,3 +150,13 @@ def test_what_is_called_free_is_free_where_the_nearest_node_errs(generator):
         assert float(clearance) == pytest.approx(float(room[which] - room.max() + 1e-3), abs=1e-12)
         assert float(clearance) >= 0
     assert erred > 0
+
+
+def test_a_pose_that_is_no_pose_is_not_opened():
+    """Transposed, or of another scale, it would come back as it is."""
+    hand, grasp = pinch("barrett")
+    pose = grasp.obj_from_hand
+    assert torch.equal(opened_pose(hand, grasp.pregrasp, pose, None), pose)
+    for wrong in (pose.mT.contiguous(), 1000 * pose):
+        with pytest.raises(BadArgument, match="obj_from_hand: expected a rigid transform"):
+            opened_pose(hand, grasp.pregrasp, wrong, grasp.table)

@@ -253,6 +253,26 @@ def test_bad_arguments_and_a_mixture_of_other_limits_fingers_or_fingertips_are_r
     assert len(query_mixture(hand, contacts, dataclasses.replace(mixture, meta={})))
 
 
+def test_a_mixture_of_postures_in_degrees_or_millimetres_is_refused():
+    """Its energies would be far too great: no contacts would seem to be within reach."""
+    hand, samples, mixture = barrett()
+    contacts = touched_contacts(hand, samples.joints[:2], torch.eye(4).double())
+    h = hand.dof
+    for part, factor, found in (
+        (slice(0, h), 180 / np.pi, "mean joints"),
+        (slice(h, h + 3), 1000.0, "mean distances"),
+    ):
+        size = torch.ones_like(mixture.means[0])
+        size[part] = factor
+        other = dataclasses.replace(
+            mixture,
+            means=mixture.means * size,
+            covariances=mixture.covariances * size * size[:, None],
+        )
+        with pytest.raises(BadArgument, match=f"mixture: expected .*got {found}"):
+            query_mixture(hand, contacts, other)
+
+
 def test_many_triples_are_answered_as_each_alone(motion):
     hand, samples, mixture = barrett()
     contacts = touched_contacts(hand, samples.joints[5000:5600], motion)  # more than one pass

@@ -9,7 +9,7 @@ from tests.make import near, real, touched_contacts
 from torchgrasp import Contacts, load_hand, load_mixture, sample_configurations, solve_ik
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
-from torchgrasp.ik import CollisionWorld, PostureLibrary
+from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures
 from torchgrasp.ik.cobyla import refine_by_cobyla
 from torchgrasp.ik.configuration import Configuration
 
@@ -141,6 +141,12 @@ def test_bad_arguments_are_named(scene):
     nan = Contacts(contacts.points * torch.nan, contacts.normals)
     with pytest.raises(BadArgument, match=r"contacts\.points"):
         solve_ik(hand, nan, mixture, library=library)
+    # the centre of a round tip would be as many radii off the surface
+    long = Contacts(contacts.points, 3 * contacts.normals)
+    with pytest.raises(BadArgument, match=r"contacts\.normals: expected unit vectors"):
+        solve_ik(hand, long, mixture, library=library)
+    with pytest.raises(BadArgument, match=r"contacts\.normals: expected unit vectors"):
+        nearest_postures(library, long, CollisionWorld())
     with pytest.raises((BadArgument, TypeError), match="method"):
         solve_ik(hand, contacts, mixture, method="newton", library=library)  # pyright: ignore
     other = load_mixture("barrett" if hand.name == "allegro" else "allegro")

@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from torchgrasp import load_hand, sample_configurations
+from torchgrasp import fit_mixture, load_hand, sample_configurations
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.posture_model.mixture import encode_fingertips
+from torchgrasp.posture_model.sample import HandSamples
 
 
 @pytest.fixture(autouse=True)
@@ -73,6 +74,14 @@ def test_a_hand_that_can_hardly_move_is_refused(monkeypatch):
     )
     with pytest.raises(BadArgument, match=r"hand: expected .*got 0 kept of 5000 postures"):
         sample_configurations(load_hand("barrett"), 10, sampling="grasping")
+
+
+def test_each_joint_of_samples_has_a_name():
+    """Found only after a whole fit, it would cost hours."""
+    numbers = torch.rand(20, 2)
+    samples = HandSamples(numbers, torch.rand(20, 6), ("a",))
+    with pytest.raises(BadArgument, match="samples: expected one for each, got 1 names of 2"):
+        fit_mixture(samples, 1)
 
 
 @pytest.mark.parametrize(("name", "value"), [("n", 0), ("seed", -1), ("workers", 0)])

@@ -11,7 +11,7 @@ from torchgrasp import Scene, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.safe_files import read_image_file
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.scene.masks import read_labels, read_mask
+from torchgrasp.scene.masks import read_labels, read_mask, read_told_labels
 
 LABELS = np.array([[0, 0, 2, 2], [1, 1, 0, 2], [1, 0, 0, 0]])
 SHAPE = LABELS.shape
@@ -323,3 +323,46 @@ def test_table_in_a_mask_is_told_where_it_is_more_than_a_rim(small_and_large, sh
     mask = parts(small_and_large, share * float(large / table), 0.0, 1.0)
     notes = masked(small_and_large, mask).notes
     assert any("lie on the support and were removed" in note for note in notes) == told
+
+
+def test_a_smaller_mask_lies_above_a_larger_one_and_of_equal_ones_the_last():
+    chance = np.random.default_rng(0)
+    masks = [chance.random((6, 7)) < share for share in (0.9, 0.2, 0.5, 0.2, 0.7)]
+    masks.append(masks[1])
+    stack = read_labels(masks, (6, 7)).numpy()
+    for place in np.ndindex(6, 7):
+        here = [(mask.sum(), -k) for k, mask in enumerate(masks, start=1) if mask[place]]
+        assert stack[place] == (-min(here)[1] if here else 0)
+
+
+def test_a_mask_within_another_one_is_told():
+    """Tools that segment parts give a handle within its cup, which is then two objects."""
+    whole, part, beside = (np.zeros((20, 20), dtype=bool) for _ in range(3))
+    whole[2:18, 2:12] = True
+    part[4:9, 3:9] = True
+    beside[4:16, 9:19] = True  # a quarter of it is in the first one
+    assert read_told_labels([whole, beside], whole.shape)[1] == ()
+    assert read_told_labels([part, beside], whole.shape)[1] == ()
+    for masks, told in (
+        ([whole, part], "mask 1: objects 2 lie within it"),
+        ([part, beside, whole], "mask 3: objects 1 lie within it"),
+        ([whole, part, np.roll(part, 8, 0)], "mask 1: objects 2, 3 lie within it"),
+        ([whole, whole], "mask 1: objects 2 lie within it"),
+    ):
+        (note,) = read_told_labels(masks, whole.shape)[1]
+        assert note.startswith(told) and note.endswith("leave out the masks of its parts")
+
+
+def test_a_scene_tells_a_mask_within_another_one():
+    scene = see((0.0, 0.0, 0.08, 0.1))
+    whole = np.zeros(scene.image.depth.shape, dtype=bool)
+    rows, columns = scene.pixels[scene.labels == 1].T.numpy()
+    whole[rows, columns] = True
+    part = whole.copy()
+    part[: int(np.median(rows))] = False
+    given = scene.image.depth, scene.image.intrinsics, scene.image.obj_from_camera
+    cut = Scene.from_depth(*given, labels=[whole, part])
+    assert [note for note in cut.notes if "within" in note] == [
+        "mask 1: objects 2 lie within it, and count as other objects: leave out the masks of its parts"
+    ]
+    assert not Scene.from_depth(*given, labels=[whole]).notes

@@ -1,11 +1,12 @@
 """scripts/reproduce.py: rows of a table share plans and errors."""
 
 import dataclasses
+import shutil
 
 import pytest
 import torch
 from paper.rows import Row, TableSpec
-from paper.trials import most_certain_first, riskiest_first, run_cells
+from paper.trials import most_certain_first, riskiest_first, run_cells, subjects
 
 from tests.pinch import pinch
 from torchgrasp.foundation.base import join
@@ -22,6 +23,21 @@ def test_rows_share_plans_and_errors(steps, tmp_path):
     assert steps.count == 1 + 2 * 4  # one plan; two grasps and two draws in each row
     assert [lift.status for lift in one.lifts] == [lift.status for lift in two.lifts]  # equal seeds
     assert list(run_cells(spec, rows)) == first and steps.count == 9
+
+
+def test_objects_of_equal_names_are_told_apart_in_results(tin, tmp_path):
+    """They would share files, and the second object would get the results of the first."""
+    other = shutil.copytree(tin, tmp_path / "more")
+    names = {subject.label for subject in subjects(TableSpec(tmp_path, (tin,), own=False))}
+    assert names == {"tin"}
+    both = subjects(TableSpec(tmp_path, (tin, other), own=False))
+    assert {subject.label: subject.folder for subject in both} == {
+        "tin of objects": tin,
+        "tin of more": other,
+    }
+    same = shutil.copytree(tin, tmp_path / "elsewhere" / "objects")
+    with pytest.raises(BadArgument, match="objects: expected folders of different names"):
+        subjects(TableSpec(tmp_path, (tin, same), own=False))
 
 
 def test_the_riskiest_grasp_has_the_greatest_sum_of_variances():

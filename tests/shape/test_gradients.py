@@ -367,6 +367,30 @@ def test_estimates_beside_the_domain_have_derivatives_too(kernel: str):
     check(partial(predict, shape), radius * directions(4, seed=5))
 
 
+def test_further_normals_of_another_length_are_refused_as_the_first_ones_are():
+    """A normal is a slope of the distance: twice the length would stretch the shape."""
+    shape = shape_of("rbf")
+    for factor in (0.1, 3.0):
+        wrong = dataclasses.replace(SEEN, normal=factor * SEEN.normal)
+        with pytest.raises(BadArgument, match=r"observations\.normal: expected unit vectors"):
+            shape_of("rbf", wrong)
+        with pytest.raises(BadArgument, match=r"new\.normal: expected unit vectors"):
+            shape.append(wrong)
+
+
+def test_negative_noise_and_a_kernel_that_ties_no_points_are_refused():
+    """The square hides a sign; a length in metres leaves the surface unknown between points."""
+    for field in ("distance_noise", "normal_noise"):
+        wrong = dataclasses.replace(SEEN, **{field: -getattr(SEEN, field)})
+        with pytest.raises(BadArgument, match=rf"observations\.{field}: expected at least 0"):
+            shape_of("rbf", wrong)
+    cloud = PointCloud(0.05 * SEEN.x)
+    for short in (rbf_kernel(0.03), matern52_kernel(0.02)):
+        with pytest.raises(BadArgument, match=r"kernel: expected a longer one.*normalised"):
+            condition(SEEN, FRAME, cloud, kernel=short)
+    assert condition(SEEN, FRAME, cloud, kernel=rbf_kernel(1.0)).kind == "guess"
+
+
 def test_what_is_not_differentiable_refuses_by_name():
     shape = shape_of("rbf")
     y = SEEN.distance.clone().requires_grad_()

@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import shutil
+import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
@@ -9,9 +11,11 @@ import torch
 import trimesh
 
 from tests.pinch import QUICK, close, cylinder, pinch, quick_trial
-from torchgrasp import Status, close_hand
+from torchgrasp import Status, close_hand, load_hand
 from torchgrasp.evaluation import PROTOCOLS, GraspTrial, Truth, pull_grasp
 from torchgrasp.evaluation.trial import TrialDriver, TrialRun
+from torchgrasp.foundation.errors import HandFileError, MendedInput
+from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.sim import SceneSpec, open_scene
 from torchgrasp.values.closing import ClosingOptions
 from torchgrasp.values.planning import Contacts
@@ -39,6 +43,49 @@ def test_simulators_hold_a_cylinder_with_equal_forces(name):
     assert np.abs(here.forces[-1] - there.forces[-1]).max() < 0.6
     assert np.abs(here.object_pose[-1] - there.object_pose[-1]).max() < 0.05
     assert set(here.joint_names) == set(there.joint_names)
+
+
+def without_mass(folder, *links):
+    """Barrett's hand, whose links of these names have no <inertial>."""
+    folder = shutil.copytree(load_hand("barrett").urdf_path.parent, folder / "barrett")
+    robot = ET.parse(folder / "hand.urdf")
+    for name in links:
+        (link,) = (x for x in robot.findall("link") if x.attrib["name"] == name)
+        link.remove(link.find("inertial"))
+    robot.write(folder / "hand.urdf")
+    return load_hand(folder)
+
+
+def opened(hand, simulator):
+    """A scene with the hand."""
+    ball = trimesh.creation.icosphere(radius=0.02)
+    urdf = read_urdf(hand.urdf_path)
+    joints = dict.fromkeys((joint.name for joint in urdf.movable), 0.5)
+    tips = hand.tips.links
+    spec = SceneSpec(urdf.path, np.eye(4), joints, hand.actuators, tips, ball, [ball], 0.1)
+    return open_scene(spec, simulator)
+
+
+def test_a_link_without_inertial_weighs_nothing_in_both_simulators(tmp_path):
+    """SAPIEN gives it the density of water, and a moment of inertia of at least 1e-6 kg m^2."""
+    hand = without_mass(tmp_path, "f3_tip")
+    scene = opened(hand, "sapien")
+    there = {link.name: link for link in scene.hand.links}
+    model = opened(hand, "mujoco").model
+    for link in read_urdf(hand.urdf_path).links:
+        mass = float(model.body(link.name).mass[0])
+        inertia = max(model.body(link.name).inertia)
+        assert there[link.name].mass == pytest.approx(mass, rel=1e-4, abs=2e-6)
+        assert max(there[link.name].inertia) == pytest.approx(inertia, rel=1e-3, abs=2e-9)
+    assert model.body("f3_tip").mass[0] == 0
+
+
+def test_a_body_without_mass_is_told_by_sapien_and_refused_by_mujoco(tmp_path):
+    hand = without_mass(tmp_path, "f3_tip", "f3_dist")
+    with pytest.warns(MendedInput, match="links without mass .f3_dist.*give each an <inertial>"):
+        opened(hand, "sapien")
+    with pytest.raises(HandFileError, match="f3_dist"):
+        opened(hand, "mujoco")
 
 
 @pytest.mark.parametrize("pull", [10.0, 300.0])

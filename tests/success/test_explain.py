@@ -134,6 +134,35 @@ def test_grasps_and_hand_may_have_different_dtypes():
         )
 
 
+def test_grasps_in_single_precision_carry_what_they_carry():
+    """The forces are proven to a millionth, which float32 does not reach."""
+    grasp, hand, shape = jug()
+    task = GraspTask(mass=0.25)
+    exact = explain_success(grasp, hand, shape, task)
+    rough = explain_success(grasp.to(torch.float32), hand, shape, task)
+    assert [cost.cause for cost in rough] == [cost.cause for cost in exact]
+    for one, other in zip(rough, exact, strict=True):
+        assert one.log_odds == pytest.approx(other.log_odds, abs=0.02)
+    assert not any("no forces of the fingers" in cost.sentence for cost in rough)
+
+
+def test_another_hand_and_a_shape_that_is_elsewhere_are_refused():
+    grasp, hand, shape = jug()
+    right = load_shipped_grasp("jug", "allegro")
+    assert explain_success(right, load_hand("allegro"), shape)
+    with pytest.raises(
+        BadArgument, match=r"hand: expected allegro, as the grasps name.*got allegro_left"
+    ):
+        explain_success(right, load_hand("allegro_left"), shape)
+    with pytest.raises(BadArgument, match="hand: expected index,middle,thumb, as the grasps name"):
+        explain_success(right, load_hand("allegro", ("index", "ring", "thumb")), shape)
+    beside = torch.eye(4, dtype=torch.float64)
+    for x in (0.06, 0.1, 3.0):
+        beside[0, 3] = x
+        with pytest.raises(BadArgument, match="shape: expected the shape of the grasped object"):
+            explain_success(grasp, hand, shape.moved(beside))
+
+
 def test_no_grasps_and_grasps_of_unknown_friction_are_refused():
     grasp, hand, shape = jug()
     with pytest.raises(BadArgument, match="grasps"):

@@ -10,7 +10,7 @@ from tests.make import directions
 from torchgrasp import GraspTask
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.success.task import TaskName, loads_of
+from torchgrasp.success.task import TaskName, TaskWrenches, loads_of
 from torchgrasp.values.specs import TrialSpec
 
 
@@ -65,6 +65,19 @@ def test_a_hand_presses_as_told_grips_in_a_lift_and_presses_a_little_in_pulls():
     assert (
         GraspTask().pressing(True) == 0.0 and GraspTask().pressing(False) == TrialSpec().strongest
     )
+
+
+def test_a_load_far_from_its_object_is_refused():
+    """A point in millimetres would turn the object with a thousand times the torque."""
+    eye = torch.eye(4, dtype=torch.float64)
+    center = torch.tensor([0.1, 0.0, 0.05], dtype=torch.float64)
+    push = torch.tensor([[0.0, 0.0, -2.5, 0.0, 0.0, 0.0]])
+    near = TaskWrenches(push, torch.tensor([0.15, 0.0, 0.0]))
+    torque = loads_of(near, 0.4, center, eye, table=True)[0, 3:]
+    assert torque.tolist() == pytest.approx([0.0, 0.15 * 2.5, 0.0], abs=1e-6)
+    far = TaskWrenches(push, torch.tensor([150.0, 0.0, 0.0]))
+    with pytest.raises(BadArgument, match=r"resist\.point: expected one within 2 m, in metres"):
+        loads_of(far, 0.4, center, eye, table=True)
 
 
 @pytest.fixture

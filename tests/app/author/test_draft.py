@@ -29,6 +29,7 @@ def drafted(urdf, *tips):
     return urdf.parent
 
 
+@pytest.mark.usefixtures("few_draws")
 def test_a_draft_for_the_claw_passes_the_law(claw):
     hand = check_hand(drafted(claw))
     assert hand.joint_names == tuple(
@@ -67,6 +68,7 @@ def test_a_draft_finds_what_the_shipped_hands_have(tmp_path, name, tips):
     assert check_hand(tmp_path).joint_names == load_hand(name).joint_names
 
 
+@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     "tip", ['<box size="0.02 0.018 0.03"/>', '<cylinder radius="0.008" length="0.03"/>']
 )
@@ -86,6 +88,7 @@ def test_a_tip_that_is_not_round_gets_a_pad_on_its_side(claw, tip):
     assert depth - 0.002 < float(reach) <= depth + 1e-9
 
 
+@pytest.mark.usefixtures("few_draws")
 def test_of_four_fingers_those_grasp_that_face_each_other(tmp_path):
     """Allegro's thumb faces its fingers; three fingers beside each other practically never do."""
     (tmp_path / "hand.urdf").write_bytes((hands_folder() / "allegro" / "hand.urdf").read_bytes())
@@ -112,6 +115,7 @@ def with_more_fingers(claw, *more):
     return claw
 
 
+@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     "more", [(("ring", "left", -0.07),), (("ring", "left", -0.07), ("index", "right", 0.07))]
 )
@@ -134,6 +138,7 @@ def test_a_draft_declares_every_number_of_fingers(claw, more):
     assert "thumb" in {finger.name for finger in spec.fingers}
 
 
+@pytest.mark.usefixtures("few_draws")
 def test_named_tips_are_taken_in_their_order(claw):
     tips = ("thumb_tip", "ring_tip", "left_tip", "right_tip")
     spec = read_hand_toml(
@@ -239,12 +244,14 @@ OVERLAPPING = "".join(
 )
 
 
+@pytest.mark.usefixtures("few_draws")
 def test_names_of_the_urdf_cannot_break_the_toml(claw):
     text = claw.read_text().replace("left_", "le&quot;ft # \\_")
     claw.write_text(text)
     assert check_hand(drafted(claw)).joint_names[0] == 'le"ft # \\_swivel'
 
 
+@pytest.mark.usefixtures("few_draws")
 def test_a_third_hand_goes_the_whole_way(claw):
     """From the URDF to a model of its postures and to grasps of a box, each checked again."""
     folder = drafted(claw)

@@ -14,6 +14,8 @@ from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import load_hand
 from torchgrasp.testing import check_hand, random_joints
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 mujoco = pytest.importorskip("mujoco")
 
 

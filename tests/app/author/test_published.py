@@ -14,6 +14,8 @@ from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.hand.urdf import read_published, read_urdf
 from torchgrasp.testing import check_hand, random_joints
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 END = "</robot>"
 
 

@@ -20,6 +20,8 @@ from torchgrasp.foundation.errors import HandFileError, MissingExtra
 from torchgrasp.foundation.limits import MESH_FACES
 from torchgrasp.hand.urdf import read_urdf
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 
 def scene(kind, size=(16.0, 20.0, 56.0)):
     """A box beside the origin, moved there by a node of the scene."""

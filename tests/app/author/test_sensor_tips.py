@@ -15,6 +15,8 @@ from torchgrasp.hand.load import hands_folder
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.testing import check_hand, random_joints
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 TIPS = ("left_tip", "right_tip", "thumb_tip")
 
 

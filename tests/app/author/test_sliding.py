@@ -4,10 +4,13 @@ import re
 
 import mujoco
 import numpy as np
+import pytest
 
 from tests.mjcf_hands import BEND, CURL, ROUND, SWIVEL, THREE, finger, model
 from torchgrasp.app.author.draft import new_hand
 from torchgrasp.hand.load import load_hand
+
+pytestmark = pytest.mark.usefixtures("few_draws")
 
 SLIDE = '<limit lower="-0.01" upper="0.02" effort="{0}" velocity="{1}"/>'
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from torchgrasp.app import cli
-from torchgrasp.app.author.visuals import VISUAL, _thinned
+from torchgrasp.app.author.visuals import VISUAL, _thinned, link_meshes
 from torchgrasp.app.report.glb import write_glb
 from torchgrasp.app.report.solids import solids_by_link, solids_of_links
 from torchgrasp.data.shipped import load_object, load_shipped_grasp
@@ -71,6 +71,21 @@ def test_a_visual_that_cannot_be_read_leaves_the_collision_shapes(barrett, parts
     found = solids_of_links(load_hand(barrett))
     for one, other in zip(found, solids_of_links(load_hand("barrett")), strict=True):
         np.testing.assert_array_equal(one.vertices, other.vertices)
+
+
+def test_a_link_with_too_much_detail_takes_no_place_of_the_others(barrett, monkeypatch):
+    """The meshes of a hand have one limit; a link beyond it is left out, and no link after it."""
+    fine = trimesh.creation.icosphere(FINE + 1, 20.0)
+    fine.export(barrett / "looks" / "fine.stl")
+    mesh = '<mesh filename="looks/fine.stl" scale="0.001 0.001 0.001"/>'
+    urdf = barrett / "hand.urdf"
+    urdf.write_text(with_visual(urdf.read_text(), "palm", visual(mesh)))
+    both = link_meshes(urdf, urdf.read_bytes(), barrett)
+    assert set(both) == {"palm", "f1_dist"}
+    monkeypatch.setattr("torchgrasp.app.author.visuals.HAND_MESH_BYTES", fine.vertices.nbytes)
+    link_meshes.cache_clear()
+    assert set(link_meshes(urdf, urdf.read_bytes(), barrett)) == {"f1_dist"}
+    link_meshes.cache_clear()
 
 
 def test_a_glb_shows_the_visual(barrett, tmp_path):

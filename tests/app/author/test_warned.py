@@ -16,6 +16,8 @@ from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.hand.urdf import read_published, read_urdf
 from torchgrasp.testing import random_joints
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 FINGERS = ("left", "right", "thumb")
 INERTIA = '<inertia ixx="{0}" ixy="0" ixz="0" iyy="{0}" iyz="0" izz="{0}"/>'
 
@@ -284,7 +286,7 @@ def test_the_numbers_of_shipped_hands_are_usual(name):
     assert find_unusual(urdf, shape_points(urdf, urdf.path.parent)) == []
 
 
-def test_check_names_them_too(claw, capsys, monkeypatch):
+def test_check_names_them_too(claw, capsys, monkeypatch, undrawn):
     monkeypatch.setattr("torchgrasp.app.cli.hands._try_objects", lambda hand, bar: True)
     claw.write_text(re.sub(r'effort="[\d.]+"', 'effort="10000"', claw.read_text()))
     assert main(["hand", "new", str(claw)]) == 0

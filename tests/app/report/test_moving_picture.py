@@ -128,7 +128,7 @@ def test_the_command_closes_the_hand_and_writes_a_gif(run_command, tmp_path, mon
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--out", "lift.avi"], "--out: expected a file that ends in .gif or .mp4"),
+        (["--out", "lift.avi"], "--out: expected a file ending in .gif or .mp4"),
         (["--out", "lift.gif"], "--mesh: expected a mesh where"),
         (
             ["--out", "lift.gif", "--rank", "7"],
