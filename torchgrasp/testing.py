@@ -161,8 +161,7 @@ def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:
     for link in urdf.links:
         if not link.mass > 0:
             yield urdf.wrong(f"link {link.name} of mass {link.mass} kg", "a positive mass")
-        xx, xy, xz, yy, yz, zz = link.inertia
-        principal = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        principal = np.linalg.eigvalsh(link.inertia_matrix)
         if principal[0] <= 0 or principal[0] + principal[1] < principal[2] * (1 - LAWS.rounding):
             yield urdf.wrong(
                 f"link {link.name} of principal inertias {principal}",

@@ -94,7 +94,7 @@ def judge_view(
         facing = share_facing(cloud.points, cloud.normals, cloud.viewpoint)
     seeing = eye if facing >= FACING else None
     # An estimate may be on the wrong side of a table. The origin of a camera's frame is not.
-    trusted = seeing if seeing is None or given or not bool(seeing.any()) else None
+    trusted = seeing if seeing is None or given or not seeing.any() else None
     support = find_ground(points, trusted, up, ADVICE.narrow)
     ground = None if support is None else support.plane
 
@@ -164,7 +164,7 @@ def _judge_backward(
     radius = norm(points - points.mean(0)).max()
     far = bool(norm(points.mean(0)) > GUESS.far * radius)
     least = math.cos(math.radians(GUESS.half_view))
-    if not far or not bool((-points[:, 2] > least * away).all()):
+    if not far or not (-points[:, 2] > least * away).all():
         return None
     found = "points around the negative z axis, as in a camera's frame with y up and z backward"
     fix = "if it is OpenGL's, multiply them by diag(1, -1, -1) and give --up or --camera-pose"
@@ -246,7 +246,7 @@ def _judge_height(
     level = "the lowest point" if table is None else "the table"
     place = f"{below:.2f} m below {level} along the vertical {_triple(normal)}"
 
-    if is_along_z(points) and float(up[2]) > ADVICE.z_up and not bool(eye.any()):
+    if is_along_z(points) and float(up[2]) > ADVICE.z_up and not eye.any():
         axis = torch.tensor([0.0, -1.0, 0.0])
         why = "for a level camera"
         if ground is not None:
@@ -303,7 +303,7 @@ def _judge_pixels(cloud: PointCloud, viewpoint: Vector) -> Advice | None:
     """
     points = cloud.points.double()
     inlier = find_inliers(points)
-    if bool(inlier.all()) or int(inlier.sum()) < ADVICE.fewest:
+    if inlier.all() or int(inlier.sum()) < ADVICE.fewest:
         return None
     stray = points[~inlier]
     _, index = spatial.KDTree(points[inlier].numpy()).query(stray.numpy())

@@ -174,22 +174,18 @@ def check_where(name: str, distance: Callable[[Points], Tensor], cloud: PointClo
     A region of another name that is far off raises the warning `NoEffect` instead. So does a region
     "keep" that holds the whole cloud and the space behind it.
     """
-    rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
-    seen = cloud.points[rows].double().cpu()
-    length = float(norm(seen.amax(0) - seen.amin(0)))
+    seen, length, ray = _sight(cloud)
     space = seen
     room = AGREEMENT.unseen
-    if cloud.viewpoint is None:
+    if ray is None:
         room += length / 2
     else:
-        eye = cloud.viewpoint.double().cpu()
-        ray = unit(seen - (eye if eye.ndim == 1 else eye[rows]))
         depth = torch.linspace(0, length, AGREEMENT.levels, dtype=seen.dtype)[:, None, None]
         space = (seen + depth * ray).reshape(-1, 3)
     signed = distance(space)
     off = float(signed.min())
     if off <= room:
-        if name == "keep" and bool((signed < 0).all()):
+        if name == "keep" and (signed < 0).all():
             everything = "it holds all of the object's points and the space behind them"
             warn_user(NoEffect, f"{name} changes nothing: {everything}; expected a part, in metres")
         return
@@ -266,6 +262,19 @@ def noise_of(cloud: PointCloud) -> float:
     return float(assume_noise(cloud.points.double().cpu(), eye).median())
 
 
+def _sight(cloud: PointCloud) -> tuple[Points, float, Points | None]:
+    """Return some points [m] of a cloud, how long they are [m], and the unit vectors along which
+    its cameras saw them. The vectors are None without a camera.
+    """
+    rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
+    seen = cloud.points[rows].double().cpu()
+    length = float(norm(seen.amax(0) - seen.amin(0)))
+    if cloud.viewpoint is None:
+        return seen, length, None
+    eye = cloud.viewpoint.double().cpu()
+    return seen, length, unit(seen - (eye if eye.ndim == 1 else eye[rows]))
+
+
 def distance_behind(points: Points, cloud: PointCloud) -> Float[Tensor, "n"]:
     """Return each point's distance (n,) [m] from a cloud and the space hidden behind it, 0 inside.
 
@@ -273,14 +282,10 @@ def distance_behind(points: Points, cloud: PointCloud) -> Float[Tensor, "n"]:
     camera it reaches half this length in all directions. `points` (n, 3) [m] are in the frame of
     the cloud.
     """
-    rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
-    seen = cloud.points[rows].double().cpu()
-    length = float(norm(seen.amax(0) - seen.amin(0)))
+    seen, length, ray = _sight(cloud)
     away = points[:, None] - seen  # (n, m, 3)
     # Without a camera, the space around the cloud counts as hidden.
-    if cloud.viewpoint is None:
+    if ray is None:
         return (norm(away).amin(1) - length / 2).clamp_min(0)
-    eye = cloud.viewpoint.double().cpu()
-    ray = unit(seen - (eye if eye.ndim == 1 else eye[rows]))
     behind = (away * ray).sum(-1, keepdim=True).clamp(0, length)
     return norm(away - behind * ray).amin(1)

@@ -151,7 +151,7 @@ def _check_outside(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> None:
         return  # no box: `cast_mesh` refuses such a mesh
     low, high = torch.from_numpy(np.array(mesh.bounds))
     eye = obj_from_camera[:3, 3].cpu()
-    if bool(((low < eye) & (eye < high)).all()):
+    if ((low < eye) & (eye < high)).all():
         found = f"a camera within the mesh's box, which is {float((high - low).max()):.4g} m long"
         raise BadArgument("camera_pose", found, "a camera outside the object, both in metres")
 

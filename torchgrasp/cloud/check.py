@@ -199,12 +199,12 @@ def coordinate_step(points: Points) -> float:
         return 0.0
     step = 0.0
     single = found.float()
-    if bool((single.double() == found).all()):
+    if (single.double() == found).all():
         farthest = single.abs().max()
         beyond = torch.nextafter(farthest, torch.full_like(farthest, torch.inf))
         step = float(beyond) - float(farthest)
     counts = found / CLOUD.digit
-    if bool(((counts - counts.round()).abs() < CLOUD.equal).all()):
+    if ((counts - counts.round()).abs() < CLOUD.equal).all():
         step = max(step, CLOUD.digit)
     return step if step >= CLOUD.coarse else 0.0
 

@@ -26,7 +26,7 @@ from torchgrasp.cloud.pose import (
     tell_large,
     tell_tilt,
 )
-from torchgrasp.cloud.rays import tell_rays
+from torchgrasp.cloud.rays import tell_rays, unproject
 from torchgrasp.cloud.sensor import Image
 from torchgrasp.cloud.surroundings import tell_strip
 from torchgrasp.foundation.checks import checked
@@ -196,9 +196,7 @@ def _points(
     if lens is not None:
         x, y = lens.rays(k, torch.stack([column, row], -1).to(k)).unbind(-1)
         return torch.stack([z * x, z * y, z], -1)
-    x = z * (column - k[0, 2]) / k[0, 0]
-    y = z * (row - k[1, 2]) / k[1, 1]
-    return torch.stack([x, y, z], -1)  # (n, 3)
+    return unproject(z, k, row, column)
 
 
 def frustum_of_image(
@@ -259,7 +257,7 @@ def read_depth(
         allowed = f"an image of bool or uint8 of the depth's size {tuple(image.shape)}"
         raise BadArgument("mask", describe_array(mask), allowed)
     inside = pixels != 0
-    if not bool(inside.any()):
+    if not inside.any():
         raise BadArgument("mask", "no pixel inside", "a mask that is not 0 at the object's pixels")
     marks, count = pixels[inside].unique(return_counts=True)
     # the border of a mask that was scaled has many numbers, each in few pixels
@@ -284,7 +282,7 @@ def _in_metres(image: Tensor, unit: float | None) -> Image:
     metres = torch.where(torch.isfinite(metres), metres, 0.0)
     if whole and float(counts.max()) == SATURATED:
         metres = torch.where(counts == SATURATED, 0.0, metres)
-    if bool((metres < 0).any()):
+    if (metres < 0).any():
         allowed = "depths >= 0, where 0 and NaN mean not measured"
         raise BadArgument("depth", f"{float(metres.min()):.4g} m", allowed)
 
@@ -339,4 +337,4 @@ def _step_of(measured: Float[Tensor, "n"]) -> float:
         return 0.0
     step = float(some.diff().min())
     counts = (some - some[0]) / step
-    return step if bool(((counts - counts.round()).abs() < DEPTH.even).all()) else 0.0
+    return step if ((counts - counts.round()).abs() < DEPTH.even).all() else 0.0

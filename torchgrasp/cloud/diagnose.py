@@ -147,7 +147,7 @@ def diagnose_cloud(
     vertical = torch.tensor([0.0, 0.0, 1.0]) if up is None else check_tensor("up", up, (3,)).cpu()
     cloud = cloud.to("cpu")
     table = None if table is None else table.to("cpu")
-    if not bool(vertical.any()):
+    if not vertical.any():
         raise BadArgument("up", "a vector of length zero", "the direction that points up")
     vertical = unit(vertical.double())
     whole = remove_duplicates(cloud)

@@ -163,7 +163,7 @@ def parse_intrinsics(
     if k.shape not in ((3, 3), (3, 4), (4, 4)):
         raise BadArgument("intrinsics", f"shape {tuple(k.shape)}", allowed)
     check_tensor("intrinsics", k, tuple(k.shape))
-    if bool(k[:3, 3:].any()):
+    if k[:3, 3:].any():
         found = f"a fourth column {k[:3, 3].tolist()}"
         raise BadArgument("intrinsics", found, f"{allowed}: K of this camera")
 
@@ -192,7 +192,7 @@ def _cut(
     # A side of 0 is that of the whole sensor, which may be unknown.
     whole = torch.tensor(size or [0.0, 0.0]).to(sides)
     sides = torch.where(sides > 0, sides, whole) / bins
-    stated = sides.floor().tolist() if bool(sides.all()) else size
+    stated = sides.floor().tolist() if sides.all() else size
     return torch.cat([binned, k[2:]]), stated
 
 
@@ -374,7 +374,7 @@ def _check_size(k: Matrix, stated: list[float] | None, width: int, height: int) 
         low = -LIMITS.corner * own
         high = (1 + LIMITS.corner) * own - image
         inside = bool(((corner > low) & (corner < high)).all())
-        if inside and bool((corner.abs() > LIMITS.moved * own).any()):
+        if inside and (corner.abs() > LIMITS.moved * own).any():
             return
         if torch.equal(own, image):
             return
@@ -387,7 +387,7 @@ def _check_size(k: Matrix, stated: list[float] | None, width: int, height: int) 
         scale = centre / image
         if float(scale.min()) > LIMITS.scaled or float(scale.max()) < 1 / LIMITS.scaled:
             sizes.append(image * scale.mean())
-        near = [m for m in sizes if bool(((centre / m - 1).abs() < LIMITS.centred).all())]
+        near = [m for m in sizes if ((centre / m - 1).abs() < LIMITS.centred).all()]
         if not near or float((centre / image - 1).abs().max()) < LIMITS.off:
             _tell_crop(image, centre)
             return
@@ -417,7 +417,7 @@ def _tell_crop(image: Float[Tensor, "2"], centre: Float[Tensor, "2"]) -> None:
     own = float((centre / image - 1).abs().max())
     if own < LIMITS.cropped or any(torch.equal(mode, image) for mode in modes):
         return
-    whole = [mode for mode in modes if bool((mode >= image).all())]
+    whole = [mode for mode in modes if (mode >= image).all()]
     whole = [mode for mode in whole if float((centre / mode - 1).abs().max()) < LIMITS.cropped]
     if whole:
         size, full = (" x ".join(f"{side:g}" for side in sides) for sides in (image, whole[0]))

@@ -113,7 +113,7 @@ class Lens(NamedTuple):
         # the polynomial folds where the determinant changes its sign
         good = (off <= LENS.same) & (torch.linalg.det(jacobian) > 0)
         good = good & (torch.diagonal(jacobian, dim1=-2, dim2=-1) > 0).all(-1)
-        if not bool(good.all()):
+        if not good.all():
             count = int((~good).sum())
             folded = f"a distortion {describe(self.coefficients)} that folds at {count} pixels"
             raise BadArgument("intrinsics", folded, "the coefficients of this camera, or fewer")

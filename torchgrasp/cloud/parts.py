@@ -14,7 +14,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import NoSupport, TooFewPoints
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.linalg import Points, Vector, norm, number_components
+from torchgrasp.geometry.linalg import Points, Vector, norm, number_cells, number_components
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SUPPORTS, SupportPlane
 from torchgrasp.geometry.support_search import find_supports
@@ -69,10 +69,7 @@ def label_bodies(points: Points, gap: float = PARTS.gap) -> Int[Tensor, "n"]:
     device = points.device
     points = points.cpu()
     # One point of each cell of a quarter of the gap, so that dense clouds have few pairs.
-    cells = torch.floor((points - points.amin(0)) / (gap / 4)).long()
-    size = cells.amax(0) + 1
-    number = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
-    _, group = torch.unique(number, return_inverse=True)
+    group = number_cells(points - points.amin(0), gap / 4)
     first = first_of_each(group)
     pairs = spatial.KDTree(points[first].numpy()).query_pairs(gap, output_type="ndarray")
     label = number_components(pairs, len(first))[group.numpy()]

@@ -98,7 +98,7 @@ def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None
     directions = directions[directions @ up.to(points) > PIXELS.above]
     eyes = centre + PIXELS.usual * directions
     score = irregularity(probes, near, eyes)
-    if not bool((score < PIXELS.promising).any()):
+    if not (score < PIXELS.promising).any():
         return None
     best = torch.topk(score, min(PIXELS.starts, len(score)), largest=False).indices
     eye, least = _refine(probes, near, centre, eyes[best])

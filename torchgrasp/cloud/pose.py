@@ -208,11 +208,11 @@ def check_rigid(name: str, pose: Tensor) -> Transform:
     if fix := FIXES.get(tuple(pose.shape)):
         raise BadArgument(name, f"shape {tuple(pose.shape)}", f"a 4 x 4 matrix: {fix}")
     check_tensor(name, pose, (4, 4))
-    if bool(is_rigid(pose)):
+    if is_rigid(pose):
         return pose
     nearest, angle = nearest_rotation(pose[:3, :3])
     mended = torch.cat([torch.cat([nearest.to(pose), pose[:3, 3:]], -1), pose[3:]])
-    if angle > POSE.rounded or not bool(is_rigid(mended)):
+    if angle > POSE.rounded or not is_rigid(mended):
         raise BadArgument(name, f"{pose.tolist()}{_describe_fault(pose.double())}", RIGID)
     fault = f"{name}: its rotation is rounded, {angle:.1g} degrees from the nearest"
     warn_user(MendedInput, f"{fault}, which is taken; write six decimals")
@@ -221,11 +221,11 @@ def check_rigid(name: str, pose: Tensor) -> Transform:
 
 def _describe_fault(pose: Transform) -> str:
     """Return, as the end of a sentence, why a matrix is no rigid transform, and the fix."""
-    if bool(pose[3, :3].any()) and not bool(pose[:3, 3].any()):
+    if pose[3, :3].any() and not pose[:3, 3].any():
         return ", a transposed pose: give its transpose"
     turn = pose[:3, :3]
     length = torch.linalg.vector_norm(turn, dim=0)
-    if not bool((length > 0).all()) or pose[3].tolist() != [0, 0, 0, 1]:
+    if not (length > 0).all() or pose[3].tolist() != [0, 0, 0, 1]:
         return ""
     if float(torch.linalg.det(turn)) < 0:
         return ", a mirrored rotation: its axes are left-handed"
@@ -342,9 +342,8 @@ def find_plausible(
     Raises `NoSupport` if there is no plane.
     """
     eye = pose[:3, 3]
-    image_up = -pose[:3, 1] if up is None and _is_own(pose) else None
     try:
-        supports = find_table(points, eye, table, up, target, image_up)
+        supports = find_table(points, eye, table, up, target, _image_up(pose, up))
         if table is None and up is None and not _is_own(pose):
             supports = _level(supports, points, eye, target)
     except NoSupport as error:
@@ -398,9 +397,8 @@ def check_view(
     unit of the depth. Then the camera may be up to 10 m above the table, else up to 4 m
     (`POSE.highest`, `POSE.high`).
     """
-    image_up = -pose[:3, 1] if up is None and _is_own(pose) else None
     try:
-        supports = find_table(points, pose[:3, 3], None, None, target, image_up)
+        supports = find_table(points, pose[:3, 3], None, None, target, _image_up(pose, up))
     except NoSupport:
         return None
     _check_supports(supports, pose, up, known_unit)
@@ -413,6 +411,16 @@ def _is_own(pose: Transform) -> bool:
     """
     turn = float(torch.diagonal(pose[:3, :3]).min())
     return turn > POSE.turn and float(norm(pose[:3, 3])) < POSE.shift
+
+
+def _image_up(pose: Transform, up: object) -> Vector | None:
+    """Return the direction (3,) that is up in the image; None where `up` or a pose tells more."""
+    return -pose[:3, 1] if up is None and _is_own(pose) else None
+
+
+def _degrees(cosine: float) -> float:
+    """Return the angle [degrees] of a cosine, which may be rounded out of [-1, 1]."""
+    return math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
 
 
 def _check_supports(
@@ -438,7 +446,7 @@ def _check_normals(supports: tuple[SupportPlane, ...], pose: Transform, up: obje
     if up is not None:
         sky = unit(torch.as_tensor(up, dtype=torch.float64).cpu())
     normals = torch.stack([support.plane.normal.double() for support in supports])
-    tilt = math.degrees(math.acos(min(1.0, max(-1.0, float((normals @ sky).max())))))
+    tilt = _degrees(float((normals @ sky).max()))
     if tilt < POSE.tilt:
         return
 
@@ -464,7 +472,7 @@ def _check_normals(supports: tuple[SupportPlane, ...], pose: Transform, up: obje
     if not fixes and (tilt < POSE.sloped or upright):
         return  # a frame that is tilted
 
-    angle = math.degrees(math.acos(max(-1.0, cosine)))
+    angle = _degrees(cosine)
     normal = ", ".join(f"{x:.2f}" for x in normals[0].tolist())
     found = f"a table whose normal ({normal}) is {angle:.0f} degrees from up"
     other = "`up`, if z is not up" if up is None else "another `up`"
@@ -492,8 +500,7 @@ def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
                 "transposed, and objects are mirrored: give depth.T, and cx and cy to match",
             )
         return ()
-    cosine = float(plane.normal[2])
-    tilt = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+    tilt = _degrees(float(plane.normal[2]))
     if tilt < POSE.told:
         return ()
     wrong = "a wrong camera_pose or focal length, or depth that is no distance, such as a z-buffer"
@@ -501,11 +508,16 @@ def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
     return (f"the table is tilted by {tilt:.0f} degrees from z of camera_pose: {fixes}",)
 
 
+def _drawn(points: Points) -> Float[Tensor, "m 3"]:
+    """Return some of the points, evenly drawn, in float64 on the CPU."""
+    return points[:: 1 + len(points) // POSE.drawn].double().cpu()
+
+
 def _check_given_table(points: Points, plane: Plane) -> None:
     """Refuse a given table that the camera did not see: it is above most points, or far below all
     points.
     """
-    height = plane.height(points[:: 1 + len(points) // POSE.drawn].double())
+    height = plane.height(_drawn(points))
     low = float(torch.quantile(height, POSE.lowest))
     middle = float(height.median())
     on = float((height.abs() < POSE.on_table).double().mean())
@@ -522,7 +534,7 @@ def tell_layer(points: Points, plane: Plane) -> tuple[str, ...]:
     The layer is perhaps the true table. It is 10 mm thick and holds at least 20 % of the points
     (`LAYER.share`). `points` (n, 3) [m] and the `plane` are in one frame.
     """
-    height = plane.height(points[:: 1 + len(points) // POSE.drawn].double().cpu())
+    height = plane.height(_drawn(points))
     near = height[(height > -LAYER.above) & (height < LAYER.below)]
     if not len(near):
         return ()
@@ -585,9 +597,7 @@ def tell_large(points: Points, pose: Transform, plane: Plane | None) -> tuple[st
     are those of the object. `plane` is the table in their frame, None if none is found. The `pose`
     (4, 4) [m] leads from the camera's frame to theirs.
     """
-    ends = torch.tensor([SIZES.ends, 1 - SIZES.ends], dtype=torch.float64)
-    low, high = points.double().quantile(ends.to(points.device), 0)
-    size = float((high - low).max())
+    size = float(_extent(points.double().cpu()).max())
     if size <= SIZES.large:
         return ()
     if plane is None:
@@ -602,6 +612,13 @@ def tell_large(points: Points, pose: Transform, plane: Plane | None) -> tuple[st
     return (f"depth: {found}: {fix}",) * far
 
 
+def _extent(points: Points) -> Vector:
+    """Return the sides (3,) [m] of the box of an object, without flying pixels at its ends."""
+    ends = torch.tensor([SIZES.ends, 1 - SIZES.ends], dtype=torch.float64)
+    low, high = points.quantile(ends, 0)
+    return high - low
+
+
 def tell_furniture(points: Points, labels: Tensor) -> tuple[str, ...]:
     """Return one note, a sentence, if an object is at least 0.6 m long (`SIZES.furniture`), else
     none.
@@ -609,14 +626,11 @@ def tell_furniture(points: Points, labels: Tensor) -> tuple[str, ...]:
     Then a wall or the floor may have been taken for the table. `labels` (n,) holds the object of
     each of the `points` (n, 3) [m], 0 for none.
     """
-    ends = torch.tensor([SIZES.ends, 1 - SIZES.ends], dtype=torch.float64)
     longest = 0.0
     for k in labels.unique().tolist():
         part = points[labels == k]
         if k > 0 and len(part) >= SIZES.points:
-            part = part[:: 1 + len(part) // POSE.drawn].double().cpu()
-            low, high = part.quantile(ends, 0)
-            longest = max(longest, float((high - low).norm()))
+            longest = max(longest, float(_extent(_drawn(part)).norm()))
     if longest < SIZES.furniture:
         return ()
     fix = "if the table is wrong, too, give it, or up"

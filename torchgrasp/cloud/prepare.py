@@ -393,6 +393,8 @@ def merge_clouds(
     makes the density even.
 
     Two different views from one place raise a `CloudWarning`: perhaps one pose was given twice.
+    Another one tells the views whose camera is unknown. It is estimated from their points, and
+    counts as given in the result.
 
     Overlapping views are compared. If they are farther apart than noise explains, `MendedInput`
     warns. Their distance becomes the result's `pose_error` [m], which widens the standard
@@ -431,11 +433,13 @@ def merge_clouds(
         raise BadArgument("clouds", f"points of {sorted(types)}", "one dtype on one device")
     views = [_view_in_frame(cloud, pose) for cloud, pose in zip(clouds, rigid, strict=True)]
     if len(views) == 1:
+        _tell_guesses(clouds)
         return views[0]
     if align:
         views = [_move(view, *moved) for view, moved in zip(views, align_views(views), strict=True)]
     _tell_same_place(clouds, views)
     errors = _compare_views(clouds, views)
+    _tell_guesses(clouds)
     normals = [v.normals for v in views if v.normals is not None]
     # Each point has its camera: a view's viewpoint and frustum are repeated for its points.
     viewpoints = [v.viewpoint.expand(len(v), 3) for v in views if v.viewpoint is not None]
@@ -443,7 +447,7 @@ def merge_clouds(
     frustums = [v.frustum.expand(len(v), 4, 3) for v in views if v.frustum is not None]
     frustum = torch.cat(frustums) if len(frustums) == len(views) else None
     points = torch.cat([v.points for v in views])
-    pose_error = errors if bool(errors.any()) else None
+    pose_error = errors if errors.any() else None
     return check_cloud(PointCloud(points, torch.cat(normals), viewpoint, frustum, pose_error))
 
 
@@ -452,6 +456,14 @@ def _move(view: PointCloud, pose: Transform, error: float) -> PointCloud:
     view = _view_in_frame(view, pose)
     known = view.points.new_zeros(len(view)) if view.pose_error is None else view.pose_error
     return dataclasses.replace(view, pose_error=known.clamp_min(error))
+
+
+def _tell_guesses(clouds: Sequence[PointCloud]) -> None:
+    """Warn (`CloudWarning`) of views whose camera is unknown, and estimated for their normals."""
+    guessed = [k for k, x in enumerate(clouds) if x.viewpoint is None and x.normals is None]
+    if guessed:
+        found = f"the cameras of {guessed} are guessed from the points, and count as given"
+        warn_user(CloudWarning, f"clouds: {found}; give each cloud its viewpoint")
 
 
 def _tell_same_place(clouds: Sequence[PointCloud], views: Sequence[PointCloud]) -> None:

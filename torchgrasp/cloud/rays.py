@@ -36,6 +36,20 @@ class RayNumbers:
 RAYS = RayNumbers()
 
 
+def unproject(
+    depth: Float[Tensor, "*b"], intrinsics: Float[Tensor, "3 3"], row: Tensor, column: Tensor
+) -> Float[Tensor, "*b 3"]:
+    """Return the points [m], in the camera's frame, of pixels at depths [m].
+
+    `intrinsics` are in pixels. `row` and `column` are those of the pixels; they broadcast with
+    `depth`.
+    """
+    k = intrinsics
+    x = depth * (column - k[0, 2]) / k[0, 0]
+    y = depth * (row - k[1, 2]) / k[1, 1]
+    return torch.stack([x, y, depth], -1)
+
+
 def tell_rays(depth: Float[Tensor, "h w"], intrinsics: Float[Tensor, "3 3"]) -> tuple[str, ...]:
     """Return one note, a sentence, if depths (h, w) [m] are perhaps distances along the rays, or
     inverse depths; else none.
@@ -51,9 +65,7 @@ def tell_rays(depth: Float[Tensor, "h w"], intrinsics: Float[Tensor, "3 3"]) -> 
     if not len(z):
         return ()
     k = intrinsics.double()
-    x = (column - k[0, 2]) / k[0, 0]
-    y = (row - k[1, 2]) / k[1, 1]
-    rays = torch.stack([x, y, torch.ones_like(x)], -1)  # at a depth of 1 m
+    rays = unproject(torch.ones_like(z), k, row, column)  # at a depth of 1 m
     height, width = depth.shape
     patch = row * RAYS.patches // height * RAYS.patches + column * RAYS.patches // width
     # of few points, no share is known

@@ -13,10 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
-from torchgrasp.cloud.neighbours import NEAR, draw_rows, find_inliers, fit_local_planes
+from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_local_planes
 from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.pixels import is_lattice
 from torchgrasp.cloud.ply import format_ply, parse_ply
+from torchgrasp.cloud.prepare import lie_across
 from torchgrasp.cloud.safe_files import parse_npy, parse_npz, unread_arrays
 from torchgrasp.cloud.viewpoint import GUESS, can_see, is_along_z, is_before_origin
 from torchgrasp.files import explain, read_bounded, write_file
@@ -31,10 +32,9 @@ from torchgrasp.foundation.errors import (
 )
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import CLOUD_BYTES, CLOUD_POINTS
-from torchgrasp.foundation.rules import check_unmasked
+from torchgrasp.foundation.rules import check_suffix, check_unmasked
 from torchgrasp.foundation.told import warn_user
-from torchgrasp.geometry.linalg import norm
-from torchgrasp.geometry.linalg import unit as unit_vectors
+from torchgrasp.geometry.linalg import norm, unit_of_any
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
 
@@ -65,17 +65,6 @@ class ReadNumbers:
     """Least share of rows with such a length at which columns 4 to 6 are normals."""
     drawn: int = 2000
     """Greatest number of points by which a camera in the origin is judged."""
-    fitted: float = 0.7
-    """Least median cosine between normals and planes fitted to points: with less they are colours.
-    """
-    alike: float = 0.999
-    """Least cosine of nearly all normals with their median at which they are alike, as one colour
-    is.
-    """
-    across: float = 0.1
-    """Quantile of these cosines that must reach `fitted` in place of the median, if nearly all
-    normals are alike.
-    """
     searched: int = 1000
     """Number of rows, about, among which a point that stands for missing pixels is sought."""
     fewest: int = 100
@@ -313,8 +302,7 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
         raise BadArgument("table", "a table with an edge", "one without an edge, for a file")
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
     arrays |= {} if table is None else {"table": np.array([*table.normal.tolist(), table.offset])}
-    if path.suffix.lower() not in (".npz", ".ply"):
-        raise BadArgument("path", path, "a file ending in .npz or .ply")
+    check_suffix("path", path, ".npz", ".ply")
     if path.suffix.lower() == ".npz":
         return write_file(path, lambda file: np.savez_compressed(file, **arrays))  # pyright: ignore[reportArgumentType]
     several = cloud.viewpoint is not None and cloud.viewpoint.ndim == 2
@@ -360,7 +348,7 @@ def make_cloud(
     error = arrays.get("pose_error")
     if of_file and arrays.get("viewpoint") is not None:
         viewpoint = scale * _as_rows(source, "viewpoint", arrays["viewpoint"])
-        if not bool(torch.isfinite(viewpoint).all()):
+        if not torch.isfinite(viewpoint).all():
             found = f"{source}: a viewpoint with NaN or infinity"
             raise BadArgument("path", found, "a viewpoint of finite numbers")
     if normals is not None and len(normals) != len(points):
@@ -462,17 +450,7 @@ def _fit_surface(arrays: dict[str, Any]) -> bool:
     rows = np.concatenate([arrays[name].reshape(-1, 3) for name in ("points", "normals")], -1)
     rows = torch.from_numpy(rows.astype(np.float64))
     rows = rows[torch.isfinite(rows).all(1) & rows[:, 3:].any(1)].unique(dim=0)
-    points = rows[:, :3]
-    if len(points) < NEAR.plane:
-        return True  # too few for planes
-    drawn = draw_rows(len(points), READ.drawn)
-    given = unit_vectors(rows[drawn, 3:])
-    cosine = (fit_local_planes(points, drawn)[0] * given).sum(-1).abs()
-    usual = unit_vectors(given.median(0).values)
-    alike = float(((given @ usual) > READ.alike).double().mean()) >= READ.normals
-    # most points of one colour may lie on the one face of which it is the normal
-    least = cosine.quantile(READ.across) if alike else cosine.median()
-    return float(least) > READ.fitted
+    return not lie_across(rows[:, :3], rows[:, 3:])
 
 
 def _find_measured(
@@ -483,7 +461,7 @@ def _find_measured(
     """
     total = len(points)
     finite = torch.isfinite(points).all(1)
-    if not bool(finite.all()):
+    if not finite.all():
         notes.append(f"{int((~finite).sum())} of {total} rows with NaN or infinity were left out")
     origin = (points == 0).all(1)
     if int(origin.sum()) > 1:
@@ -547,7 +525,7 @@ def _tell_own_frame(cloud: PointCloud, turn: Float[Tensor, "4"]) -> list[str]:
     if float(norm(turn[1:])) > 0:
         rotation = spatial.transform.Rotation.from_quat(turn[[1, 2, 3, 0]].numpy())
         axes = torch.from_numpy(rotation.as_matrix()).to(points)
-        ahead = unit_vectors(points.mean(0) - eye) @ axes
+        ahead = unit_of_any(points.mean(0) - eye) @ axes
         past = max(float(ahead[0]), float(ahead[2])) < GUESS.ahead
     own = is_lattice(points, torch.zeros_like(eye)) and not is_lattice(points, eye)
     if not past and not own:
@@ -564,7 +542,7 @@ def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:
     points are ahead of the origin along z.
     """
     points = cloud.points[draw_rows(len(cloud), READ.drawn)]
-    if bool(points.ne(points[0]).any()):  # else all coincide, which is refused later
+    if points.ne(points[0]).any():  # else all coincide, which is refused later
         points = points[find_inliers(points)]
         below = bool((points[:, 2] > 0).all()) and not is_along_z(points)
         origin = torch.zeros(3, dtype=points.dtype)

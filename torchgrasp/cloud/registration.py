@@ -391,7 +391,7 @@ def _find_motion(fixed: _ViewSurface, view: _ViewSurface) -> Motion | None:
     along = (_displacement(step, arms) * view.normals).sum(-1)
     distance = float(along.square().mean().sqrt())
     # the part of a motion that the overlap does not show, by its variance along the normals
-    by_step = torch.cat([view.normals, torch.linalg.cross(arms, view.normals)], -1)
+    by_step = _by_step(view.normals, arms)
     spread = float((by_step * torch.linalg.solve(moments, by_step.T).T).sum())
     hidden = min(spread / float((by_step.square() / prior).sum()), MOTION.hidden)
     unsure = distance * math.sqrt(hidden / (1 - hidden))
@@ -409,6 +409,14 @@ def _displacement(step: Float[Tensor, "6"], arms: Points) -> Points:
     return arms @ rotation_from_vector(step[3:]).T + step[:3] - arms
 
 
+def _by_step(normals: Points, arms: Points) -> Float[Tensor, "n 6"]:
+    """Return the derivatives of the motions of points along their `normals` by a step of the view.
+
+    `arms` [m] are the places of the points from the middle about which the step turns.
+    """
+    return torch.cat([normals, torch.linalg.cross(arms, normals)], -1)
+
+
 def _linearise(
     fixed: _ViewSurface, view: _ViewSurface, centre: Vector, step: Float[Tensor, "6"], most: float
 ) -> tuple[Float[Tensor, "m 6"], Float[Tensor, "m"]]:
@@ -421,13 +429,13 @@ def _linearise(
     arms = (view.points[view.drawn] - centre) @ turn.T
     normals = view.normals[view.drawn] @ turn.T
     over, height, own = fixed.match(arms + centre + step[:3], normals, most)
-    rows = [torch.cat([own, torch.linalg.cross(arms, own)], -1)[over]]
+    rows = [_by_step(own, arms)[over]]
     heights = [height[over]]
     # the fixed points in the frame of the view
     arms = fixed.points[fixed.drawn] - centre - step[:3]
     normals = fixed.normals[fixed.drawn] @ turn
     over, height, own = view.match(arms @ turn + centre, normals, most)
     own = own @ turn.T
-    rows.append(-torch.cat([own, torch.linalg.cross(arms, own)], -1)[over])
+    rows.append(-_by_step(own, arms)[over])
     heights.append(height[over])
     return torch.cat(rows), torch.cat(heights)

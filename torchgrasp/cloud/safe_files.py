@@ -185,7 +185,7 @@ def _check_palette(pixels: np.ndarray, palette: list[int]) -> None:
     """
     colours = np.array(palette).reshape(-1, 3)
     black = [k for k in np.unique(pixels).tolist() if k < len(colours) and not colours[k].any()]
-    if black and bool(colours[0].any()):
+    if black and colours[0].any():
         raise Malformed(f"a palette where black has number {black[0]}; save it as RGB")
 
 

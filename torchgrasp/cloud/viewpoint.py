@@ -184,7 +184,7 @@ def can_see(points: Points, normals: Points, viewpoint: Vector) -> bool:
     others = centre + GUESS.distance * radius * fibonacci_sphere(GUESS.directions).to(points)
     bulge, density = _explain(points, normals, torch.cat([viewpoint[None], others]))
     score = bulge + GUESS.density * density
-    if bool(density[0] > 0) or bool(score[0] > score.max() - GUESS.better):
+    if density[0] > 0 or score[0] > score.max() - GUESS.better:
         return True
     try:
         find_supports(points, viewpoint)
@@ -242,7 +242,7 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
     edge_on = float((dot(ray, normals).abs() < UNSEEN.grazing).double().mean())
     middle = (points.amax(0) + points.amin(0)) / 2
     forward = middle - viewpoint
-    if not bool(forward.any()) or bool(((points - viewpoint) @ forward <= 0).any()):
+    if not forward.any() or ((points - viewpoint) @ forward <= 0).any():
         return edge_on, 1.0  # within the cloud, or beside it
     axes = torch.linalg.svd(unit(forward)[None]).Vh  # forward, or backward, and two axes across
     local = (points - viewpoint) @ axes.T

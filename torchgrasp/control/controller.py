@@ -63,7 +63,7 @@ class GraspController:
     `Targets`, on the CPU. A tick is the time between two steps.
 
     A closing controller brings the fingers to the object, then a hold controller presses. After
-    pressing for 0.5 s (`PRESSING_TIME`), `closed` becomes true. The hand may then be lifted, but
+    pressing for 0.9 s (`PRESSING_TIME`), `closed` becomes true. The hand may then be lifted, but
     `step` must still be called at each tick.
 
     If the plan has a table and `options` allow several attempts, the grasp is judged before the
@@ -194,7 +194,7 @@ class GraspController:
 
     @property
     def closed(self) -> bool:
-        """Whether the hand has closed and pressed for 0.5 s (`PRESSING_TIME`), so that it may be
+        """Whether the hand has closed and pressed for 0.9 s (`PRESSING_TIME`), so that it may be
         lifted.
 
         If another attempt is allowed (`ClosingOptions.attempts`), the grasp must also seem strong
@@ -406,7 +406,7 @@ class GraspController:
             self.pressed += period
             judging = self.check is not None and not self.check.judged
             if judging and isinstance(closing, UncertaintyClosing):
-                if not bool(closing.touched.all()):
+                if not closing.touched.all():
                     # without a finger that opposes them, pressing ones push the object away
                     return self._sent.joints
             return self.hold(observation, period)
@@ -450,7 +450,7 @@ class GraspController:
             palm = self.closing.palm
             begun = self.closing.begun
             touches = bool(observation.tactile.contact.any())
-            if touches and not bool(self.reference.rise.any()):
+            if touches and not self.reference.rise.any():
                 begun = palm
             self.reopening = Reopening(
                 self.reference, self.check.displacement, observation.joints, palm, begun, reach

@@ -17,7 +17,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import apply
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.linalg import limit_norm, norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.drag_plan import DragPlan
 
@@ -109,11 +109,11 @@ class DragController:
             found = f"{len(plan.joints)} joints, {len(plan.presses)} fingertips"
             raise BadArgument("plan", found, f"{hand.dof} and {len(hand.tips)}, as the hand has")
         plan = plan.to("cpu", torch.float64)
-        if not bool(plan.presses.any()):
+        if not plan.presses.any():
             raise BadArgument("plan", "no finger that presses", "one or two")
         if not plan.force > 0.0:
             raise BadArgument("plan", f"a force of {plan.force:g} N", "a positive one")
-        if not bool(plan.displacement.any()):
+        if not plan.displacement.any():
             raise BadArgument("plan", "no displacement", "one along the table")
         turn = plan.obj_from_hand[:3, :3]
         self.plan = plan
@@ -126,7 +126,7 @@ class DragController:
         self.tips = hand.tip_centres(plan.joints)
         radius = hand.tips.radius[:, None]
         off = norm(apply(plan.obj_from_hand, self.tips) - radius * plan.table.normal - plan.feet)
-        if not bool((off < DRAGGING.agree)[plan.presses].all()):
+        if not (off < DRAGGING.agree)[plan.presses].all():
             found = "a plan whose feet are not below the fingertips of this hand"
             raise BadArgument("plan", found, "a plan of this hand")
         # the height of the palm at which the tips are in the table
@@ -168,7 +168,7 @@ class DragController:
         elif self.phase == "drag":
             self._move(observation.tips, force, period)
         elif self.phase == "up":
-            self.lag = self.lag - _shortened(self.lag, self.straighten * period)
+            self.lag = self.lag - limit_norm(self.lag, self.straighten * period)
             self.height += DRAGGING.rise * period
             if self.height >= DRAGGING.height:
                 self.phase = "done"
@@ -177,7 +177,7 @@ class DragController:
     def _check_forces(self, tactile: TactileState) -> None:
         """Raise `BadArgument` for readings of fingertips that sense only whether they touch."""
         flags = tactile.contact & (tactile.reading == WAITING_FORCE)
-        if bool((flags & (tactile.forces == 0.0).all(-1)).any()):
+        if (flags & (tactile.forces == 0.0).all(-1)).any():
             found = "those of `feel_flags`, which have no forces"
             raise BadArgument("observation.tactile", found, "readings of forces, in newtons")
 
@@ -204,8 +204,8 @@ class DragController:
         bent = (tips - self.tips)[self.presses].mean(0)
         depth = float(bent @ self.up)
         behind = depth * self.up - bent
-        more = _shortened(behind - self.lag, DRAGGING.catching * period)
-        self.lag = _shortened(self.lag + more, DRAGGING.lag)
+        more = limit_norm(behind - self.lag, DRAGGING.catching * period)
+        self.lag = limit_norm(self.lag + more, DRAGGING.lag)
         self.time += period
         self.share = min(self.time * DRAGGING.speed / float(norm(self.way)), 1.0)
         self.height += self._speed(force, True) * period
@@ -224,9 +224,3 @@ class DragController:
             return -(DRAGGING.touching if near else DRAGGING.fastest)
         speed = DRAGGING.gain * (force - self.plan.force)
         return max(-DRAGGING.touching, min(speed, DRAGGING.touching))
-
-
-def _shortened(vector: Float[Tensor, "3"], most: float) -> Float[Tensor, "3"]:
-    """Return a vector, shortened to the length `most` if it is longer; both may be 0."""
-    length = float(norm(vector))
-    return vector if length <= most else vector * (most / length)

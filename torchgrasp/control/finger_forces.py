@@ -198,7 +198,7 @@ def _check_reached(hand: Hand, grasps: Grasps) -> None:
     check_unit_vectors("grasps.contacts.normals", normals)
     behind = dot(centres - points, normals) < 0
     good = grasps.status == Status.OK
-    if bool(behind[good].all(-1).any()):
+    if behind[good].all(-1).any():
         found = "normals that point from fingertips into the object"
         raise BadArgument("grasps.contacts.normals", found, "outward normals of the object")
     # the pad lies at the contact, or the fingertip has rolled on it
@@ -208,7 +208,7 @@ def _check_reached(hand: Hand, grasps: Grasps) -> None:
         # the same hand: contacts may be known better than they were planned
         off = torch.minimum(off, (norm(centres - points) - hand.tips.radius).abs())
         most = MOVED
-    if bool((off > grasps.tip_error + most).any()):
+    if (off > grasps.tip_error + most).any():
         largest = 1000 * float(off.nan_to_num().max())
         found = f"{hand.name}, whose fingertips are up to {largest:.0f} mm off the contacts"
         raise BadArgument("hand", found, "the hand and the contacts that were planned")

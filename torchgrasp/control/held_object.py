@@ -269,7 +269,7 @@ def likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:
     """
     field = reference.surface
     points = reference.gains.target
-    if field is None or not bool((field.values < 0).any()):
+    if field is None or not (field.values < 0).any():
         ball = math.pi / 6 * float(torch.cdist(points, points).max()) ** 3
         centre = points.mean(0)
         mass = WEIGHT.density * ball

@@ -271,7 +271,7 @@ class _Barrier:
         across = np.sqrt(np.maximum((forces**2).sum(-1) - push**2, 0.0))
         above = (push > floor).all(-1)  # (g,)
         self.floor = floor
-        if not bool(above.any()):
+        if not above.any():
             # only the row of the largest internal forces is left
             above = np.arange(len(tried)) == len(tried) - 1
             self.floor = np.maximum(np.minimum(floor, BARRIER.lower * push[-1]), 0.0)

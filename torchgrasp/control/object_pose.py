@@ -190,7 +190,7 @@ class Touches:
         planned pose, in the planned hand's frame.
         """
         sensed = observation.tactile
-        if bool(sensed.contact.any()):
+        if sensed.contact.any():
             finite = torch.isfinite(sensed.points) & torch.isfinite(sensed.normals)
             placed = finite.all(-1) & sensed.contact
             self.points = self.points + torch.where(placed[:, None], sensed.points + palm, 0.0)

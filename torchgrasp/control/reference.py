@@ -175,7 +175,7 @@ class ClosingReference(Value):
             squeeze=pressed.joints[0],
             normals=normals[0],
             gains=gains,
-            approach=unit(direction) if bool((direction != 0.0).any()) else None,
+            approach=unit(direction) if (direction != 0.0).any() else None,
             distance_variance=_distance_variance(grasp),
             friction=_friction(grasp),
             planned_table=grasp.table and grasp.table.moved(inverse(grasp.obj_from_hand[0])),
@@ -301,7 +301,7 @@ def check_plan(reference: ClosingReference) -> None:
     * The median distance of the planned contacts from `surface` exceeds 50 mm.
     """
     joints = len(reference.hand.tree.joint_names)
-    if len(reference.kp) != joints or not bool((reference.kp > 0).all()):
+    if len(reference.kp) != joints or not (reference.kp > 0).all():
         found = f"{len(reference.kp)} stiffnesses from {float(reference.kp.min()):g}"
         raise BadArgument("reference.kp", found, f"{joints} positive ones, of all joints")
     check_unit_vectors("reference.normals", reference.normals)

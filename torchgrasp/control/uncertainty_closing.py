@@ -118,14 +118,14 @@ class UncertaintyClosing:
         self.touched = torch.zeros_like(reference.normals[:, 0], dtype=torch.bool)
         self.alive = reference.alive
         self.quick = reference.sensor.kind == "tactile" and reference.sensor.noise <= 1.0
-        self.drives = None if bool(self.alive.all()) else DriveFeel(reference)
+        self.drives = None if self.alive.all() else DriveFeel(reference)
         self.strongest = strongest_lead(reference)
         self.target = reference.pregrasp
         self.share = torch.zeros_like(reference.normals[:, 0])
         self.waiting = 0.0
         self.settled = Settled(reference)
         self.low = rim_contacts(reference)
-        self.fastest = RIM.fastest if bool(self.low.any()) else math.inf  # of a target [rad/s]
+        self.fastest = RIM.fastest if self.low.any() else math.inf  # of a target [rad/s]
 
     @property
     def done(self) -> bool:
@@ -184,13 +184,13 @@ class UncertaintyClosing:
         error = error + ahead.clamp_max(0.0)[:, None] * normals
         share = torch.where(contact | rests, 1.0, blend(error, gains.covariance))
         self.share = share
-        self.waiting = self.waiting + period if bool(contact.any()) else 0.0
+        self.waiting = self.waiting + period if contact.any() else 0.0
         touching = observation.tactile.contact | (contact & ~self.alive)
         self.settled.update(observation, touching, share, period, pressing=not self.waits)
         desired = self._desired(reading, contact, rests)
         force_error = -(desired - reading)[:, None] * normals
         velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain)
-        if not bool(contact.any()):
+        if not contact.any():
             # all fingers reach their contacts at the same time
             left = ahead.clamp_min(0.0) + POSITION_FLOOR
             velocity = velocity * (left / left.max())[:, None]
@@ -303,7 +303,7 @@ class UncertaintyClosing:
         """
         desired = -dot(self.reference.gains.desired_force, self.reference.normals)
         if self.waits:
-            rest = WAITING_FORCE if bool(contact.all()) else reading.clamp_max(WAITING_FORCE)
+            rest = WAITING_FORCE if contact.all() else reading.clamp_max(WAITING_FORCE)
             desired = torch.where(contact, rest, desired)
         return torch.where(~self.alive & (contact | rests), reading, desired)
 

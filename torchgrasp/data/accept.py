@@ -5,7 +5,7 @@ The decorator `checked` converts it to a value, so that all other functions take
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Protocol, TypeVar, runtime_checkable
 
@@ -16,6 +16,7 @@ from torch import Tensor
 from torchgrasp.cloud.read import make_cloud, read_cloud_file
 from torchgrasp.data.shipped import GraspObject, find_view
 from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import arguments_beside
 from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.foundation.rules import Taken, check_path, show
 from torchgrasp.foundation.told import warn_user
@@ -72,18 +73,19 @@ def as_cloud(value: Any) -> PointCloud:
     The value may be a cloud, a `GraspObject`, a file, or an array or tensor (n, 3) [m]. It may also
     be a cloud of Open3D or trimesh. The name of a shipped object means its view. An array has no
     viewpoint. `@_named` adds a second argument, the name that errors give to the value. `NoEffect`
-    warns of a file's table, which is not part of the cloud. Raises `BadArgument` for anything else,
-    and `CloudFileError` for a malformed file.
+    warns of a file's table, which is not part of the cloud, unless the call gives a table, too.
+    Raises `BadArgument` for anything else, and `CloudFileError` for a malformed file.
     """
+    told = _has_table(arguments_beside())
     if isinstance(value, PointCloud):
         return value
     if isinstance(value, GraspObject):
         return value.view
     if isinstance(value, str | Path):
         file = read_cloud_file(find_view(Path(value)))
-        if file.table is not None:
+        if file.table is not None and not told:
             found = f"its table, {file.table.describe()}, is not part of the cloud"
-            warn_user(NoEffect, f"{value}: {found}; give it as the table, unless you do")
+            warn_user(NoEffect, f"{value}: {found}; give it as the table")
         return file.tell(str(value))
     if isinstance(value, Tensor):
         return PointCloud(value)
@@ -100,6 +102,14 @@ def as_cloud(value: Any) -> PointCloud:
     normals = np.asarray(getattr(value, "normals", []))
     arrays = {"points": np.asarray(points), "normals": normals if normals.size else None}
     return make_cloud(f"a {type(value).__name__}", arrays).cloud
+
+
+def _has_table(arguments: Mapping[str, Any]) -> bool:
+    """Return whether arguments of a call name the table: as `table`, in `spec`, or in planned
+    `grasps`.
+    """
+    table = getattr(arguments.get("spec"), "table", arguments.get("table"))
+    return table is not None or "grasps" in arguments
 
 
 @_named

@@ -1,5 +1,6 @@
 """Folders of tables and cards, which libraries such as Hugging Face's `datasets` read."""
 
+import importlib
 import io
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -8,7 +9,8 @@ from typing import Any
 from torch import Tensor
 
 from torchgrasp.files import begin_folder, format_json, hold_folder, render, write_file
-from torchgrasp.foundation.errors import MissingExtra, Status
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.lazy import import_extra
 
 SOURCE = "source.json"  # file that says what a folder of tables is made from
 
@@ -18,11 +20,8 @@ def import_arrow() -> Any:
 
     Raises `MissingExtra` if it is not installed.
     """
-    try:
-        import pyarrow.parquet
-    except ImportError as error:
-        raise MissingExtra("pyarrow", "data") from error
-    return pyarrow
+    import_extra("pyarrow.parquet", "data", "pyarrow")
+    return importlib.import_module("pyarrow")
 
 
 def as_column(rows: Tensor) -> Any:

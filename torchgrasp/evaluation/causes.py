@@ -88,7 +88,7 @@ def _sizes(
     first = int(lost.int().argmax())
     heights = (lift.hand_pose[pressed:, :3, 3] - lift.hand_pose[pressed, :3, 3]) @ up
     risen = int((heights >= spec.lift_height - RAISED).int().argmax()) or -1
-    yield "dropped when pushed", math.nan if bool(lost[risen]) else math.hypot(*spec.push), 0.0
+    yield "dropped when pushed", math.nan if lost[risen] else math.hypot(*spec.push), 0.0
     rotates = bool(lost[first]) and bool(slid[first] < SLIP_DISTANCE)
     yield "turned", math.degrees(turned.max()) if rotates else math.nan, 0.0
     yield "slid", 1e3 * float(slid.max()), -1.0
@@ -101,7 +101,7 @@ def tick_of(lift: ClosureResult, phase: int) -> int:
     A phase that did not end, with NaN in `ClosureResult.phases`, gives the last tick.
     """
     end = lift.phases[phase]
-    return int((lift.time - end).abs().argmin()) if bool(end.isfinite()) else len(lift.time) - 1
+    return int((lift.time - end).abs().argmin()) if end.isfinite() else len(lift.time) - 1
 
 
 def moved_in_hand(

@@ -314,7 +314,7 @@ class _Drag:
         before = apply(torch.from_numpy(start), centre[None])[0]
         after = apply(torch.from_numpy(pose), centre[None])[0]
         wanted = self.plan.displacement
-        if not bool(torch.isfinite(moved).all()):
+        if not torch.isfinite(moved).all():
             status = Status.UNSTABLE
         else:
             vertices = moved[2, :3].numpy() @ self.vertices.T + float(moved[2, 3])

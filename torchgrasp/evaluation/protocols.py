@@ -28,6 +28,10 @@ from torchgrasp.values.specs import TrialSpec
 LEAST_MASS = 1e-3  # least mass [kg] of a task, so that no load is zero
 
 
+TURNS = Range(0.0, math.pi / 4, "an angle in [0, pi / 4] rad, not in degrees")
+"""The greatest errors [rad] of a rotation that are taken. One degree, given as 1, is refused."""
+
+
 @checked
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
@@ -39,7 +43,8 @@ class PoseNoise(Value):
 
     Args:
         translation: greatest error [m] along each axis, 0 to 0.5.
-        rotation: greatest error [rad] about each axis, 0 to pi; in lifts about the vertical only.
+        rotation: greatest error [rad] about each axis, 0 to pi / 4; in lifts about the vertical
+            only. A greater one is most often in degrees.
         draws: number of trials that `evaluate` runs for each grasp, each with its own error, at
             least 1.
 
@@ -47,7 +52,7 @@ class PoseNoise(Value):
     """
 
     translation: Displacement = 0.0
-    rotation: Annotated[float, Range(0.0, math.pi)] = 0.0
+    rotation: Annotated[float, TURNS] = 0.0
     draws: Count = 1
 
 

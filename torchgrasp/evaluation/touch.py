@@ -20,6 +20,7 @@ from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import Points, dot, norm
 from torchgrasp.geometry.mesh_distance import surface_distance
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import check_named
 from torchgrasp.values.planning import Grasps, PointCloud
 
 Verdict = Literal["touches", "apart", "penetrates", "unseen"]
@@ -40,6 +41,8 @@ class TouchNumbers:
     """Greatest gap [m] at which a fingertip counts as touching: the usual deviation of an estimated
     surface.
     """
+    farthest: float = 0.5
+    """Least distance [m] of all fingertips from the object at which it is in another frame."""
     reach: float = 1.5
     """Greatest distance of a fingertip from the cloud's nearest point, along the surface, in
     multiples of the points' spacing. Farther away, the cloud does not show the surface.
@@ -95,11 +98,11 @@ class Touch(Value):
         verdicts = list[Verdict]()
         for gaps in self.gaps:
             verdict: Verdict = "touches"
-            if bool((gaps > self.limit).any()):
+            if (gaps > self.limit).any():
                 verdict = "apart"
-            elif bool((gaps < -self.limit).any()):
+            elif (gaps < -self.limit).any():
                 verdict = "penetrates"
-            elif bool(gaps.isnan().any()):
+            elif gaps.isnan().any():
                 verdict = "unseen"
             verdicts.append(verdict)
         return verdicts
@@ -133,8 +136,9 @@ def measure_touch(
             to 0.1.
 
     Raises `BadArgument` for a hand or fingers that the grasps do not name, for joints beyond their
-    limits, and for a cloud whose normals cannot be estimated. Raises `MeshError` for a closed mesh
-    with faces turned inward, and `SuspiciousScale` for a mesh over 2 m.
+    limits, and for a cloud whose normals cannot be estimated. It is also raised for a surface more
+    than 0.5 m (`TOUCH.farthest`) from all fingertips, which is in another frame. Raises `MeshError`
+    for a closed mesh with faces turned inward, and `SuspiciousScale` for a mesh over 2 m.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -142,11 +146,12 @@ def measure_touch(
     >>> measure_touch(load_hand("allegro"), grasp, jug.mesh, limit=0.01).verdicts
     ['touches']
     """
-    _check_names(hand, grasps)
+    check_named(hand, grasps)
     hand = hand.to("cpu", torch.float64)
     joints = hand.check_joints(grasps.joints.detach().double().cpu())
     centres = apply(grasps.obj_from_hand.detach().double().cpu(), hand.tip_centres(joints))
     points = centres.reshape(-1, 3)
+    _check_frame(points, surface)
     if isinstance(surface, PointCloud):
         heights = _heights(points, surface, limit)
     else:
@@ -158,16 +163,19 @@ def measure_touch(
     return Touch(heights.reshape(centres.shape[:-1]) - hand.tip_radius, limit)
 
 
-def _check_names(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` for a hand of another name, or of other fingers, than the grasps name. The
-    joints of one finger would move another.
-    """
-    ours = {"hand": hand.name, "finger_names": ",".join(hand.finger_names)}
-    for name, own in ours.items():
-        planned = grasps.meta.get(name, own)
-        if planned != own:
-            allowed = f"{planned}, as the grasps name: `hand_of(grasps)` loads it"
-            raise BadArgument("hand", own, allowed)
+def _check_frame(points: Points, surface: "trimesh.Trimesh | PointCloud") -> None:
+    """Raise `BadArgument` if all points are far from the box around a surface."""
+    if isinstance(surface, PointCloud):
+        corners = surface.points.detach().double().cpu()
+    else:
+        corners = torch.tensor(np.asarray(surface.vertices), dtype=torch.float64)
+    if not len(points) or not len(corners):
+        return
+    beside = torch.maximum(corners.amin(0) - points, points - corners.amax(0)).clamp_min(0)
+    away = float(norm(beside).amin())
+    if away > TOUCH.farthest:
+        found = f"one {away:.3g} m from all fingertips"
+        raise BadArgument("surface", found, "the grasped object, in the frame of the grasps")
 
 
 def _check_sides(mesh: "trimesh.Trimesh") -> None:

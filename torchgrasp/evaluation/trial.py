@@ -56,6 +56,12 @@ class TrialNumbers:
     """Greatest deviation from 1 of the length of the approach, a unit vector."""
     speed: float = 0.2
     """Mean speed [m/s] of an approach in which touches do not stop the hand."""
+    slid: float = 0.75
+    """Greatest displacement [m] of an object along its table."""
+    aside: float = 2.0
+    """Greatest displacement [m] of the true hand from the planned one."""
+    off_table: float = 0.001
+    """Greatest part [m] of a displacement along the table that leads off it."""
     slack: float = 0.03
     """Distance [m] from the mesh beyond which a contact is off the mesh: objects may be a bit
     misplaced.
@@ -90,7 +96,8 @@ class Truth:
         camera: pose (4, 4) [m] of a depth camera (x right, y down, z forward). With it the robot
             looks again before the approach. None means no second look.
 
-    Raises `BadArgument` for an `error` or `camera` that is not a rigid transform.
+    Raises `BadArgument` for an `error` or `camera` that is not a rigid transform. It is raised for a
+    `slide` of more than 0.75 m (`TRIALS.slid`), or an `error` of more than 2 m (`TRIALS.aside`).
     """
 
     mesh: "trimesh.Trimesh | Path | str"
@@ -100,6 +107,18 @@ class Truth:
     neighbours: Sequence[Neighbour] = ()
     slide: Float[Tensor, "3"] | None = None
     camera: Pose | None = None
+
+    def __post_init__(self) -> None:
+        """Check that displacements are in metres."""
+        moved = None if self.error is None else self.error[:3, 3]
+        for name, vector, most in (
+            ("slide", self.slide, TRIALS.slid),
+            ("error", moved, TRIALS.aside),
+        ):
+            length = 0.0 if vector is None else float(norm(vector))
+            if length > most:
+                found = f"a displacement of {length:.4g} m"
+                raise BadArgument(name, found, f"at most {most:g} m, in metres")
 
 
 @checked
@@ -136,9 +155,16 @@ def check_truth(trial: GraspTrial) -> None:
     """Raise `BadArgument` if over 70 % of the contacts of the trial's grasps are over 30 mm off the
     true mesh. The grasps are then probably in another frame.
 
-    It is also raised if the mesh does not stand on the planned table (`Grasps.table`).
+    It is also raised if the mesh does not stand on the planned table (`Grasps.table`), or is
+    wholly below the true one.
     """
     mesh = read_mesh(trial.truth.mesh)
+    table = trial.truth.table
+    if table is not None:
+        top = float(table.height(torch.tensor(mesh.vertices, dtype=torch.float64)).max())
+        if top <= 0:
+            found = f"one {-1e3 * top:.0f} mm above the whole mesh"
+            raise BadArgument("table", found, "the true table below the object, its normal upward")
     check_contacts(trial.grasp, mesh, TRIALS.slack, AGREEMENT.astray)
 
 
@@ -257,9 +283,14 @@ def _check_effects(trial: GraspTrial, spec: TrialSpec) -> None:
     if trial.told is not None and not spec.table:
         raise BadArgument("told", "a table, for a trial without one", "None")
     slide = trial.truth.slide
-    if slide is not None and bool(slide.any()) and not spec.approach:
+    if slide is not None and slide.any() and not spec.approach:
         found = "a displacement halfway through an approach of 0 m"
         raise BadArgument("slide", found, "None, or an approach above 0 m")
+    if slide is not None:
+        off = float(slide.double() @ true_table(trial.grasp, trial.truth).normal.double().cpu())
+        if abs(off) > TRIALS.off_table:
+            found = f"a displacement of {1e3 * off:.0f} mm along the table's normal"
+            raise BadArgument("slide", found, "one along the table, in the frame of the grasp")
     if trial.surface is not None and spec.closing == "open_loop":
         warn_user(NoEffect, "surface: the closing 'open_loop' looks at no surface")
 

@@ -49,7 +49,7 @@ from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps, PointCloud
-from torchgrasp.values.specs import ContactSpec
+from torchgrasp.values.specs import MASSES, ContactSpec
 
 REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
 # greatest friction coefficient for which grasps are planned; that of some protocols is greater
@@ -210,6 +210,7 @@ def plan_view(
         cloud = read_view(view.objects, view.object, view.view)
         check_mesh(cloud, mesh)
         check_stand(mesh, Plane.horizontal(0.0))
+        _of_object(view, protocol)
         if isinstance(planned, Path):
             return _read_planned(planned, score, cloud, hand)
         started = time.process_time()  # planning alone is timed
@@ -265,9 +266,7 @@ def try_grasp(
     `BadArgument` if the protocol has a second look (`Protocol.relook`), but the view's camera
     position is unknown.
     """
-    mass = read_entry(view.objects, view.object).mass if protocol.real_mass else None
-    if mass is not None:
-        protocol = protocol.with_trial(mass=mass)
+    protocol = _of_object(view, protocol)
     others = [k for k in range(len(grasps)) if k != at[0] and protocol.tries > 1]
     grasp = grasps[[at[0], *others]]
     hand = hand_of(grasp, view.load_hand())
@@ -289,6 +288,20 @@ def try_grasp(
         deepest_mm=1000 * float(touch.deepest),
         touch=touch.verdicts[0],
     )
+
+
+def _of_object(view: ObjectView, protocol: Protocol) -> Protocol:
+    """Return the protocol with the object's real mass, if it asks for one and the manifest has it.
+
+    Raises `BadArgument` for a mass that no trial takes, such as one in grams.
+    """
+    mass = read_entry(view.objects, view.object).mass if protocol.real_mass else None
+    if mass is None:
+        return protocol
+    if not MASSES.low <= mass <= MASSES.high:
+        allowed = f"{MASSES.low:g} to {MASSES.high:g} kg for {protocol.name!r}"
+        raise BadArgument("mass_kg", f"{mass:g}", allowed)
+    return protocol.with_trial(mass=mass)
 
 
 def _draw_truth(view: ObjectView, grasp: Grasps, protocol: Protocol, seed: int) -> Truth:

@@ -82,7 +82,7 @@ def plan_motion(
     tips = arm.tip_poses(poses.flatten(0, 1))
     tips = tips.unflatten(2, poses.shape[:2])
     way, steady = track(arm, grasps.arm.T.contiguous(), tips)  # (g, 2 near + 1, n)
-    if not bool(steady.all()):
+    if not steady.all():
         lost = flatnonzero(~steady).tolist()
         found = f"the approach or the lift of grasps {lost}, which the arm cannot follow"
         raise BadArgument("grasps", found, "executable grasps of plan_grasps(arm=), unchanged")

@@ -32,12 +32,13 @@ from torchgrasp.export.postures import CONVENTIONS, OWN_FORMAT, OWN_VERSION
 from torchgrasp.files import Field, is_file, read_bytes, read_json
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import GraspFileWarning, ModelFileError, Status
+from torchgrasp.foundation.errors import BadArgument, GraspFileWarning, ModelFileError, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import CLOUD_BYTES
 from torchgrasp.foundation.rules import Pose, Poses, Positive, SmallLength
 from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import Plane, read_plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps
@@ -49,6 +50,8 @@ ROUNDING = 1e-3  # largest error of a quaternion's length: that of a file of few
 # distance [m] of opened fingertips from their contacts, and linear steps, which reach it to 1 mm
 OPENED = 0.02
 OPENING_STEPS = 4
+FARTHEST = 10.0  # distance [m] of a hand from its object's frame: farther is in millimetres
+FARTHEST_TABLE = 2.0  # greatest height [m] of all contacts above their table
 LEAST = 1e-12  # least length [m] by which a position is divided
 
 
@@ -450,7 +453,7 @@ def _at_rest(
     inside = joints.clamp(hand.lower, hand.upper)
     reached, left = reach_tips(hand, inside, tips)
     far = (left > POSTURE.same_tip) & ~still
-    if bool(far.any()):
+    if far.any():
         rows = flatnonzero(far).tolist()
         warn_user(
             GraspFileWarning,
@@ -471,10 +474,10 @@ def read_poses(
 
     Raises `ModelFileError` for a quaternion that is not of length 1.
     """
-    turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
-    far = np.abs(np.linalg.norm(turns, axis=1) - 1) > ROUNDING
+    lengths = np.linalg.norm(numbers[:, 3:], axis=1)
+    far = np.abs(lengths - 1) > ROUNDING
     if far.any():
-        length = float(np.linalg.norm(turns[far][0]))
+        length = float(lengths[far][0])
         found = f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}"
         raise _refuse(found, "length 1")
     return rigid(
@@ -484,10 +487,10 @@ def read_poses(
 
 def _matrices(numbers: np.ndarray, quaternion: Quaternion) -> Float[np.ndarray, "g 3 3"]:
     """Return the rotations of poses (g, 7), whose quaternions have an order."""
-    turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
-    if not len(turns):
+    if not len(numbers):
         return np.zeros((0, 3, 3))
-    return spatial.transform.Rotation.from_quat(turns).as_matrix()
+    first = quaternion == "wxyz"
+    return spatial.transform.Rotation.from_quat(numbers[:, 3:], scalar_first=first).as_matrix()
 
 
 def _other(quaternion: Quaternion) -> Quaternion:
@@ -533,6 +536,27 @@ def _one_side(numbers: np.ndarray, quaternion: Quaternion) -> float:
     return float(np.linalg.norm(inside.mean(0))) if len(inside) else 0.0
 
 
+def check_places(grasps: Grasps) -> None:
+    """Raise `BadArgument` for hands far from the origin, or a table that the contacts cannot have.
+
+    A hand may be up to 10 m (`FARTHEST`) from the origin. A table may be up to 2 m
+    (`FARTHEST_TABLE`) below all contacts. Some contacts may be below the table, beyond its edge.
+    """
+    if not len(grasps):
+        return
+    away = float(norm(grasps.obj_from_hand[:, :3, 3]).amax())
+    if away > FARTHEST:
+        found = f"a hand {away:.4g} m from the object's origin"
+        raise BadArgument("obj_from_hand", found, f"poses within {FARTHEST:g} m, in metres")
+    if grasps.table is None:
+        return
+    height = grasps.table.height(grasps.contacts.points)
+    if float(height.amax()) <= 0 or float(height.amin()) > FARTHEST_TABLE:
+        found = f"one with all contacts {float(height.amin()):.4g} to {float(height.amax()):.4g} m"
+        allowed = "the table under the object, in the object's frame, in metres, its normal upward"
+        raise BadArgument("table", f"{found} above it", allowed)
+
+
 @checked
 def grasps_from_joints(
     hand: Hand,
@@ -567,6 +591,8 @@ def grasps_from_joints(
             that use it. None means unknown.
 
     Raises `BadArgument` for wrong shapes, joints outside their limits, or poses that are not rigid.
+    It is raised for a hand more than 10 m (`FARTHEST`) from the origin, which is in millimetres. It
+    is also raised for a table above all contacts, or more than 2 m (`FARTHEST_TABLE`) below them.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -574,6 +600,25 @@ def grasps_from_joints(
     >>> pose = torch.eye(4, dtype=torch.float64)[None]
     >>> grasps_from_joints(hand, joints, pose).contacts.points.shape
     torch.Size([1, 3, 3])
+    """
+    grasps = place_joints(hand, joints, obj_from_hand, pregrasp, table, spec, std_m)
+    check_places(grasps)
+    return grasps
+
+
+@checked
+def place_joints(
+    hand: Hand,
+    joints: Float[Tensor, "g h"],
+    obj_from_hand: Poses,
+    pregrasp: Float[Tensor, "g h"] | None = None,
+    table: Plane | None = None,
+    spec: ContactSpec | None = None,
+    std_m: SmallLength | None = None,
+) -> Grasps:
+    """Return the result of `grasps_from_joints`, wherever hands and table are.
+
+    So a command can tell with which unit or quaternion they would be at the object.
     """
     hand = hand.to("cpu", torch.float64)
     # copies: the caller may read the next grasp into the same memory

@@ -22,7 +22,6 @@ from torchgrasp.export.postures import (
     check_all_executable,
     check_flange,
     check_still,
-    follower_joints,
     named_postures,
     quaternion,
     rename_joints,
@@ -117,8 +116,7 @@ def format_isaac(
     check_all_executable(grasps)
     check_still(hand, grasps)
     _, postures = named_postures(hand, grasps, force, kp)
-    followers = follower_joints(hand) if actuated else ()
-    names = {x: name for x, name in rename_joints(hand, rename).items() if x not in followers}
+    names = rename_joints(hand, rename, actuated)
     root = read_urdf(hand.urdf_path).root
     poses = grasps.obj_from_hand.double()
     if flange is not None:

@@ -21,8 +21,8 @@ from torchgrasp.files import format_json, write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import matplotlib, spatial, trimesh
-from torchgrasp.foundation.rules import Force, Positive
-from torchgrasp.geometry.frames import rigid
+from torchgrasp.foundation.rules import Force, Positive, check_suffix
+from torchgrasp.geometry.frames import rigid, to_array
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import opened_pose
 from torchgrasp.shape.surface import Surface
@@ -172,14 +172,14 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
     True
     """
     path = check_surface_path(path)
-    std = surface.std_m.detach().cpu().double().numpy()
+    std = to_array(surface.std_m)
     shares = np.clip(std / largest_std(surface), 0.0, 1.0)
     # as in the report
     colors = BRIGHTEST * matplotlib.colormaps["viridis"](shares) + 0.5
     mesh = trimesh.Trimesh(
-        surface.vertices.detach().cpu().double().numpy(),
+        to_array(surface.vertices),
         surface.faces.cpu().numpy(),
-        vertex_normals=surface.normals.detach().cpu().double().numpy(),
+        vertex_normals=to_array(surface.normals),
         vertex_colors=colors.astype(np.uint8),
         process=False,
     )
@@ -214,6 +214,5 @@ def check_surface_path(path: Path | str) -> Path:
     '.glb'
     """
     path = Path(path)
-    if path.suffix.lower() not in (".ply", ".glb"):
-        raise BadArgument("path", path, "a file ending in .ply or .glb")
+    check_suffix("path", path, ".ply", ".glb")
     return path

@@ -355,7 +355,6 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
     poses |= {link.name: urdf.pose_at_zero(link.name) for link in urdf.links}
     meet = {frozenset(pair) for pair in scene.self_pairs}
     drives = dict.fromkeys((slide.name for slide in scene.slides), MOUNT_DRIVE) | scene.drives
-    xx, xy, xz, yy, yz, zz = range(6)
     return {
         "parts": [hull(corners) for corners in scene.hulls[0]],
         "links": [
@@ -372,7 +371,7 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
                     vars(x) | {"place": x.xyz, "rotation": quaternion(pose_of(x)[:3, :3])}
                     for x in link.shapes
                 ],
-                **_principal(np.array(link.inertia)[[[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]]),
+                **_principal(link.inertia_matrix),
             }
             for k, link in enumerate(links)
         ],

@@ -228,18 +228,20 @@ def check_still(hand: Hand, grasps: Grasps) -> None:
     It must do so if its opened fingers would be in the table at the pose of the grasp. A format
     with one pose for each grasp cannot express this motion.
     """
-    if not bool(stands_still(hand, grasps).all()):
+    if not stands_still(hand, grasps).all():
         found = "a hand that goes down while it closes"
         raise BadArgument("grasps", found, "hands that close at one pose")
 
 
-def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str]:
+def rename_joints(
+    hand: Hand, rename: Mapping[str, str] | None, actuated: bool = False
+) -> dict[str, str]:
     """Return a dict from the name of each movable joint in the hand's URDF to its name on the
     robot.
 
     `rename` is such a dict of some joints. These joints come first, in its order; the others keep
-    their names. None keeps all names. Raises `BadArgument` for joints that the hand lacks, and for
-    equal or empty names.
+    their names. None keeps all names. With `actuated`, joints that follow others are left out.
+    Raises `BadArgument` for joints that the hand lacks, and for equal or empty names.
     """
     given = dict(rename or {})
     ours = hand.tree.joint_names
@@ -248,7 +250,8 @@ def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str
     names = given | {joint: joint for joint in ours if joint not in given}
     if "" in names.values() or len(set(names.values())) < len(names):
         raise BadArgument("rename", ", ".join(names.values()), "a name for each joint")
-    return names
+    left_out = follower_joints(hand) if actuated else ()
+    return {joint: name for joint, name in names.items() if joint not in left_out}
 
 
 def follower_joints(hand: Hand) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+import torch
 import yaml
 from jaxtyping import Float
 from torch import Tensor
@@ -22,6 +23,7 @@ from torchgrasp.export.postures import (
     rename_joints,
 )
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Pose, Positive
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
@@ -29,6 +31,7 @@ from torchgrasp.ik.motion import APPROACH_DISTANCE, UP
 from torchgrasp.values.planning import Grasps
 
 NANOSECONDS = 1e9  # in a second
+UNPRESSED = "above", "pregrasp", "grasp"  # moments of a motion before the fingers press
 OBJECT_FRAME = "object"
 """Name of the object's frame in the messages: the frame of the cloud. Publish a transform of that
 name.
@@ -190,12 +193,18 @@ def format_motion(hand: Hand, motion: ArmMotion, actuated: bool = False) -> str:
         actuated: whether to leave out coupled joints of the hand, which follow others. Controllers
             of ros2_control refuse their names.
 
+    Raises `BadArgument` for a motion of another hand, whose joints have other names or limits.
+
     >>> import torch
     >>> from torchgrasp import load_hand
-    >>> motion = ArmMotion(("a",), torch.tensor([0.0, 1.5]), torch.zeros(1, 2, 1), {"above": 0})
-    >>> format_motion(load_hand("barrett"), motion).splitlines()[-1]
+    >>> hand = load_hand("barrett")
+    >>> names = ("shoulder", *hand.tree.joint_names)
+    >>> still = torch.zeros(1, 2, len(names))
+    >>> motion = ArmMotion(names, torch.tensor([0.0, 1.5]), still, {"above": 0})
+    >>> format_motion(hand, motion).splitlines()[-1]
     '  time_from_start: {sec: 1, nanosec: 500000000}'
     """
+    _check_hand(hand, motion)
     times = [_duration(x) for x in motion.times.tolist()]
     followers = follower_joints(hand) if actuated else ()
     kept = [k for k, joint in enumerate(motion.joint_names) if joint not in followers]
@@ -207,6 +216,25 @@ def format_motion(hand: Hand, motion: ArmMotion, actuated: bool = False) -> str:
         documents.append({"joint_names": list(names), "points": points})
     what = "a trajectory_msgs/JointTrajectory of arm and hand for each grasp"
     return _document(hand, what, documents)
+
+
+def _check_hand(hand: Hand, motion: ArmMotion) -> None:
+    """Raise `BadArgument` if a motion's last joints are not those of the hand, within its limits.
+
+    Only the opened and the closed fingers are compared with the limits. Targets with which the
+    fingers press may lie beyond.
+    """
+    ours = tuple(hand.tree.joint_names)
+    last = motion.joint_names[-len(ours) :]
+    if last != ours:
+        found = f"last joints {', '.join(last)}"
+        raise BadArgument("motion", found, f"those of the hand: {', '.join(ours)}")
+    driven = [motion.joint_names.index(joint) for joint in hand.joint_names]
+    limits = hand.to("cpu", torch.float64).actuated
+    for phase in UNPRESSED:
+        if phase in motion.phases:
+            joints = motion.positions[:, motion.phases[phase], driven]
+            limits.check_limits(joints.cpu().double(), "motion.positions")
 
 
 def _trajectories(
@@ -226,9 +254,7 @@ def _trajectories(
     has the torques as effort.
     """
     squeezed, postures = named_postures(hand, grasps, force, kp)
-    followers = follower_joints(hand) if actuated else ()
-    every = rename_joints(hand, rename)
-    names = {joint: name for joint, name in every.items() if joint not in followers}
+    names = rename_joints(hand, rename, actuated)
     root = read_urdf(hand.urdf_path).root
     for row in range(len(grasps)):
         torque = dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True))

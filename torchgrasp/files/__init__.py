@@ -7,6 +7,7 @@ from torchgrasp.files.write import format_columns as format_columns, format_json
 from torchgrasp.files.write import (
     format_line as format_line,
     is_file as is_file,
+    plain_value as plain_value,
     read_bytes as read_bytes,
 )
 from torchgrasp.files.write import (

@@ -190,10 +190,11 @@ def load_tensors(
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Return the tensors and the metadata of a safetensors file, each by name.
 
-    `kind` is the word for its content, such as "grasps", that the file's metadata must hold. The
-    file must hold the tensors `names`, and may hold those in `optional`. Raises `ModelFileError`
-    for a missing or broken file, and for another kind or version of the layout. Raises it also for
-    missing or further tensors, and for numbers that are not finite, or greater than 1e30 in size.
+    `kind` is the word for its content, such as "grasps", that the file's metadata must hold. It and
+    the version of the layout are left out of the result. The file must hold the tensors `names`,
+    and may hold those in `optional`. Raises `ModelFileError` for a missing or broken file, and for
+    another kind or version of the layout. Raises it also for missing or further tensors, and for
+    numbers that are not finite, or greater than 1e30 in size.
     """
     allowed = names.union(optional)
     refuse = functools.partial(ModelFileError, "path")
@@ -220,6 +221,7 @@ def load_tensors(
         if t.is_floating_point() and not bool((t.abs() <= LARGEST_NUMBER).all()):
             found = f"{path}: a number beyond {LARGEST_NUMBER:g} or a non-finite number in {name}"
             raise refuse(found, "finite numbers")
+    del meta["kind"], meta["version"]
     return tensors, meta
 
 
@@ -247,9 +249,7 @@ def read_value(
                 raise ModelFileError(
                     "path", found, f"{fields[name][0]}, and one size for each letter"
                 )
-    return _build(of, tensors, "", rest), {
-        k: v for k, v in meta.items() if k not in ("kind", "version")
-    }
+    return _build(of, tensors, "", rest), meta
 
 
 def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ...]]:

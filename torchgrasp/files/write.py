@@ -3,6 +3,7 @@ and files.
 """
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import io
@@ -144,18 +145,26 @@ def format_json(value: Any) -> str:
     """Return a value as JSON text; a member of the enum `Status` is written as its name, NaN and
     infinity as null.
     """
-    return json.dumps(_plain(value), indent=1)
+    return json.dumps(plain_value(value), indent=1)
 
 
-def _plain(value: Any) -> Any:
-    """Return a value fit for JSON: a status becomes its name, and NaN and infinity become None."""
+def plain_value(value: Any, digits: int | None = None) -> Any:
+    """Return a value fit for JSON: a status becomes its name, a dataclass a dict, and NaN and
+    infinity become None. Numbers are rounded to `digits` decimals; None does not round them.
+    """
+    if dataclasses.is_dataclass(value):
+        return plain_value(vars(value), digits)
     if isinstance(value, dict):
-        return {key: _plain(x) for key, x in value.items()}
+        return {key: plain_value(x, digits) for key, x in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(x) for x in value]
+        return [plain_value(x, digits) for x in value]
     if isinstance(value, Status):
         return value.name
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if not isinstance(value, float):
+        return value
+    if not math.isfinite(value):
+        return None
+    return value if digits is None else round(value, digits)
 
 
 def render(

@@ -9,6 +9,7 @@ import itertools
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -21,6 +22,11 @@ FLAT = 1e-3
 """Least height of a contact triangle over its longest side. In a flatter one, noise decides the
 direction of the virtual frame.
 """
+
+
+def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
+    """Return a tensor of any shape and device as a NumPy array in float64, without its gradient."""
+    return value.detach().cpu().double().numpy()
 
 
 def rigid(
@@ -154,7 +160,7 @@ def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
     flat = degenerate(points)
     if not is_known(flat):
         points = torch.where(flat[..., None, None], torch.nan, points)
-    elif bool(flat.any()):
+    elif flat.any():
         raise DegenerateContacts(
             f"{int(flat.sum())} of {flat.numel()} contact triples lie on a line or in a point"
         )

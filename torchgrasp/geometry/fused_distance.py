@@ -3,43 +3,42 @@
 `MeshSurface.distance` defines them, by a search tree and with arrays.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from torchgrasp.foundation.fused import compiled, inlined
+from torchgrasp.geometry.box_tree import Boxes
 from torchgrasp.geometry.fused_points import find_nearest
 from torchgrasp.geometry.fused_vectors import add, dot, minus
 from torchgrasp.geometry.mesh import LEAST_SPAN
-
-if TYPE_CHECKING:
-    from torchgrasp.geometry.mesh_distance import MeshSurface, Samples
 
 LEEWAY = 1.0 + 1e-9  # factor of a squared distance, above the rounding of its sum
 
 
 def distance(
     points: np.ndarray,
-    samples: "Samples",
-    surface: "MeshSurface",
+    boxes: Boxes,
+    owner: np.ndarray,
+    triangles: np.ndarray,
+    normals: np.ndarray,
     tried: int,
 ) -> np.ndarray:
     """Return the signed distances (n,) [m] of points (n, 3) [m] from a mesh, positive outside.
 
     Args:
         points: the points, in the frame of the mesh.
-        samples: sample points of the surface, each with the index of its triangle.
-        surface: the triangles of the mesh, and the normals that give the sign.
+        boxes: sample points of the surface, in a tree of boxes.
+        owner: index (s,) of the triangle of each of the s samples.
+        triangles: corners (f, 3, 3) [m] of the f triangles.
+        normals: normals (f, 7, 3) that give the sign: of each triangle's face, sides and corners.
         tried: number of samples nearest to a point, whose triangles are tried. The distance is that
             from the nearest of these triangles.
     """
     found = np.empty(len(points))
     points = np.ascontiguousarray(points, dtype=np.float64)
     numbers = LEAST_SPAN, LEEWAY
-    low, high, leaves, index = samples.boxes
-    owner = samples.owner[index]
-    mesh = surface.triangles, surface.normals
-    _put_distances(points, low, high, leaves, owner, *mesh, tried, numbers, found)
+    low, high, leaves, index = boxes
+    mesh = owner[index], triangles, normals
+    _put_distances(points, low, high, leaves, *mesh, tried, numbers, found)
     return found
 
 

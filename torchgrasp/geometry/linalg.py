@@ -39,7 +39,7 @@ def check_unit_vectors(name: str, vectors: Float[Tensor, "*b d"]) -> None:
     """
     length = norm(vectors).flatten()
     off = (length - 1).abs().nan_to_num(0.0, posinf=torch.inf)
-    if bool((off > UNIT_TOLERANCE).any()):
+    if (off > UNIT_TOLERANCE).any():
         raise BadArgument(
             name, f"a vector of length {float(length[off.argmax()]):.6g}", "unit vectors"
         )
@@ -162,7 +162,8 @@ def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"
     """
     # a zero vector has no second derivative of its length, which does not count here
     moving = torch.where((v == 0).all(-1, keepdim=True), v.detach(), v)
-    return v * (longest / norm(moving, keepdim=True).clamp_min(longest))
+    least = max(longest, torch.finfo(v.dtype).tiny)  # both lengths may be 0
+    return v * (longest / norm(moving, keepdim=True).clamp_min(least))
 
 
 def solve_least_squares(
@@ -186,7 +187,7 @@ def cholesky(matrix: Float[Tensor, "*b n n"], what: str, fix: str) -> Float[Tens
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not is_known(matrix):
         return torch.where((info == 0)[..., None, None], factor, torch.nan)
-    if not bool((info == 0).all() & torch.isfinite(factor).all()):  # one wait for the device
+    if not (info == 0).all() & torch.isfinite(factor).all():  # one wait for the device
         finite = bool(torch.isfinite(matrix).all())
         smallest = float(torch.linalg.eigvalsh(matrix).min()) if finite else float("nan")
         raise IndefiniteCovariance(what, smallest, fix)

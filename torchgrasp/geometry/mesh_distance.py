@@ -117,7 +117,8 @@ class MeshSurface:
         if are_on():
             from torchgrasp.geometry import fused_distance  # it imports numba
 
-            return fused_distance.distance(points, samples, self, tried)
+            surface = samples.owner, self.triangles, self.normals
+            return fused_distance.distance(points, samples.boxes, *surface, tried)
         parts = []
         for begin in range(0, max(1, len(points)), MESH_DISTANCE.at_once):
             part = points[begin : begin + MESH_DISTANCE.at_once]

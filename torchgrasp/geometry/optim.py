@@ -142,7 +142,7 @@ def levenberg_marquardt(
         if every > 1:  # problems that have ended, but have not left, stay as they are
             accepted = accepted & going
             after = torch.where(going, after, damping)
-        if every == 1 and bool(accepted.all()):  # nothing to choose
+        if every == 1 and accepted.all():  # nothing to choose
             state, model = trial_state, trial
         else:
             refused = problem.refuse(model, trial)

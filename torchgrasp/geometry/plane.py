@@ -220,7 +220,7 @@ def upright_frame(
         _check_under(table, points, eyes)
         z = unit(table.normal.detach().cpu().double())
         centre = centre - table.height(centre) * z
-    elif eye is not None and bool(eye.any()):
+    elif eye is not None and eye.any():
         z = unit(eye)
         eye = None
     else:

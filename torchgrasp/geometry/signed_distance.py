@@ -13,7 +13,7 @@ from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.fused import array, is_fused
-from torchgrasp.foundation.rules import Range
+from torchgrasp.foundation.rules import Positive, Range
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh_distance import MeshSurface
 
@@ -149,7 +149,9 @@ class SignedDistanceField(DistanceField):
         origin: position (3,) [m] of node (0, 0, 0).
         spacing: distance [m] between neighbouring nodes.
         values: signed distances (x, y, z) [m]; `values[i, j, k]` is at the point `origin` + (i, j,
-            k) * `spacing`.
+            k) * `spacing`. There are at least two along each axis.
+
+    Raises `BadArgument` for a `spacing` that is not positive, or an axis with less than two nodes.
 
     >>> nodes = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3)
     >>> ball = nodes.norm(dim=1).reshape(41, 41, 41) - 0.05
@@ -160,8 +162,14 @@ class SignedDistanceField(DistanceField):
     """
 
     origin: Float[Tensor, "3"]
-    spacing: float
+    spacing: Positive
     values: Float[Tensor, "x y z"]
+
+    def __post_init__(self) -> None:
+        """Check that there are nodes between which `query` interpolates."""
+        if min(self.values.shape) < 2:
+            found = f"shape {tuple(self.values.shape)}"
+            raise BadArgument("values", found, "at least two nodes along each axis")
 
     @property
     def nodes(self) -> Float[Tensor, "n"]:

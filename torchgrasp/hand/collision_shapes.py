@@ -273,8 +273,8 @@ def met_pairs(
 ) -> Bool[Tensor, "p n"]:
     """Return a mask (p, n): whether the two links of each of p pairs overlap in each of n postures.
 
-    `pairs` holds the names of the two links of each pair. `postures` (j, n) are positions [rad or
-    m] of all j movable joints, in the order of the URDF.
+    `pairs` holds the names of the two links of each pair; a pair may occur twice. `postures` (j, n)
+    are positions [rad or m] of all j movable joints, in the order of the URDF.
     """
     tree = tree_from_urdf(urdf)
     shapes = self_collision_from_urdf(urdf, pairs)
@@ -291,7 +291,8 @@ def met_pairs(
     for chunk, count in zip(postures.split(size, 1), met.split(size, 1), strict=True):
         apart = shapes.separations(tree.frames(chunk), 0.0)  # (pairs of shapes, n)
         count.index_add_(0, owner, (apart < 0).long())
-    return met > 0
+    # a pair that occurs twice was counted in its last row
+    return (met > 0)[[index[frozenset(pair)] for pair in pairs]]
 
 
 def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Frames, ahead: int, most: int) -> None:

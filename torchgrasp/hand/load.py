@@ -203,6 +203,18 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
     return known if hand is None else with_fingers(known, fingers)
 
 
+def check_named(hand: Hand, grasps: Grasps) -> None:
+    """Raise `BadArgument` for a hand of another name, or of other fingers, than the grasps name. The
+    joints of one finger would move another.
+    """
+    ours = {"hand": hand.name, "finger_names": ",".join(hand.finger_names)}
+    for name, own in ours.items():
+        planned = grasps.meta.get(name, own)
+        if planned != own:
+            allowed = f"{planned}, as the grasps name: `hand_of(grasps)` loads it"
+            raise BadArgument("hand", own, allowed)
+
+
 def _check_names(spec: HandSpec, urdf: Urdf) -> None:
     """Raise `HandFileError` for names that the URDF lacks, and for parked joints that also grasp or
     are coupled.

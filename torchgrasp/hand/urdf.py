@@ -99,6 +99,12 @@ class Link:
     inertia: tuple[float, ...]
     shapes: tuple[LinkShape, ...]  # its collision shapes
 
+    @property
+    def inertia_matrix(self) -> np.ndarray:
+        """The symmetric matrix (3, 3) of the moments of inertia [kg m^2]."""
+        xx, xy, xz, yy, yz, zz = self.inertia
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
 
 @dataclasses.dataclass(frozen=True)
 class Joint:

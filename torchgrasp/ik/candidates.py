@@ -17,7 +17,7 @@ from torchgrasp.contacts.feasibility import first_violation
 from torchgrasp.foundation.base import Batch, Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
-from torchgrasp.foundation.rules import ANY, Length, Rows, show
+from torchgrasp.foundation.rules import ANY, Length, Rows, is_known, show
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.geometry.linalg import dot, norm, unit
 from torchgrasp.hand.hand import Hand
@@ -31,6 +31,7 @@ Reachable = Callable[[Tensor], Tensor]
 """A user's function of hand poses (k, 4, 4) [m] in the object's frame. It returns a mask (k,) of
 those that an arm reaches.
 """
+FARTHEST_CENTER = 2.0  # distance [m] of an object's centre from its contacts: no hand spans more
 # the paper's largest distance [m] of a tip from its contact: about a tip's radius
 PAPER_TOLERANCE = 10 * MILLIMETRE
 TIP_TOLERANCE = 1 * MILLIMETRE
@@ -80,7 +81,8 @@ class GraspProblem(Value):
         descends: whether the opened hand may start above the pose of the grasp. It does so if its
             opened fingers would be in the table (`opened_pose`). It then goes down while it closes.
 
-    Raises `BadArgument` if the contacts lack `std_m`.
+    Raises `BadArgument` if the contacts lack `std_m`, or for a `center` more than 2 m
+    (`FARTHEST_CENTER`) from the contacts.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -101,6 +103,16 @@ class GraspProblem(Value):
 
     def __post_init__(self) -> None:
         self.contacts.require_std()
+        points = self.contacts.points
+        center = self.center.to(points)
+        # elsewhere a plan would wait for the device
+        if points.device.type != "cpu" or not (is_known(points) and is_known(center)):
+            return
+        away = norm(points.mean(-2) - center).nan_to_num(0.0)
+        if len(away) and float(away.max()) > FARTHEST_CENTER:
+            found = f"a centre {float(away.max()):.4g} m from the contacts"
+            allowed = f"one within {FARTHEST_CENTER:g} m, in metres and in the object's frame"
+            raise BadArgument("center", found, allowed)
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "GraspProblem":
@@ -109,12 +121,12 @@ class GraspProblem(Value):
 
         Raises `IndexError` for an index beyond the last set.
         """
-        center = self.center if self.center.ndim == 1 else self.center[index]
-        contacts = self.contacts[index]
-        certificate = self.certificate[index]
-        world = self.world.rows(index)
-        return GraspProblem(
-            self.hand, contacts, certificate, world, center, self.reachable, self.descends
+        return dataclasses.replace(
+            self,
+            contacts=self.contacts[index],
+            certificate=self.certificate[index],
+            world=self.world.rows(index),
+            center=self.center if self.center.ndim == 1 else self.center[index],
         )
 
     @checked

@@ -83,7 +83,7 @@ class Obstacles(Value):
         occupancy = settle(occupancy, torch.device("cpu"))
         probability = occupancy.probability
         levels = sorted({*LEVELS, full})
-        if not bool((probability >= levels[0]).any()):
+        if not (probability >= levels[0]).any():
             return None
         distances = torch.stack(
             [distance_to(probability >= level, occupancy.spacing) for level in levels]
@@ -120,7 +120,7 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 
     `spacing` [m] is the edge of a voxel. For an empty region the distance is larger than the grid.
     """
-    if not bool(region.any()):
+    if not region.any():
         far = spacing * sum(region.shape)
         return torch.full(region.shape, far, dtype=torch.float64, device="cpu")
     steps = torch.from_numpy(np.asarray(ndimage.distance_transform_edt(~region.numpy())))

@@ -96,7 +96,7 @@ class CobylaRun:
         self.points = points.double()
         spheres = hand.collision_spheres
         groups = [(spheres.finger == k) & ~spheres.touching for k in (-2, -1, 0, 1, 2)]
-        self.groups = [flatnonzero(group) for group in groups if bool(group.any())]
+        self.groups = [flatnonzero(group) for group in groups if group.any()]
         self.last: tuple[bytes, float, np.ndarray] | None = None
 
     def place(
@@ -114,7 +114,7 @@ class CobylaRun:
         joints = (self.first + step).clamp(hand.lower.to(step), hand.upper.to(step))
         frames = hand.tree.frames(hand.expand_joints(joints)[:, None].contiguous())
         tips = self.tips(frames)
-        if bool(degenerate(tips)):
+        if degenerate(tips):
             return joints, frames, torch.eye(4, device="cpu").to(tips), False
         return joints, frames, virtual_frame(self.points) @ inverse(virtual_frame(tips)), True
 

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.contacts.certify import certify
+from torchgrasp.contacts.descent import equal_tensions, normalise_tensions, project
 from torchgrasp.contacts.feasibility import (
     FlatnessConstraint,
     check_feasibility,
@@ -28,7 +29,6 @@ from torchgrasp.contacts.problem import (
     triple_jet,
     triple_mean_jet,
 )
-from torchgrasp.contacts.solver import equal_tensions, normalise_tensions, project
 from torchgrasp.foundation.base import (
     Batch,
     at_once,
@@ -350,6 +350,6 @@ def _check_seeds(problem: GraspProblem, seeds: IKSeeds) -> None:
         allowed = f"guesses of {own[0]} joints and {own[1]} fingertips, as the hand has"
         raise BadArgument("seeds", f"guesses of {joints} joints and {tips} fingertips", allowed)
     strange = (seeds.row < 0) | (seeds.row >= sets)
-    if bool(strange.any()):
+    if strange.any():
         row = int(seeds.row[strange][0])
         raise BadArgument("seeds", f"a guess for contact set {row}", f"sets from 0 to {sets - 1}")

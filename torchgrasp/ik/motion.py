@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import flatnonzero, row_numbers, spread
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.rules import Poses
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
@@ -94,7 +95,7 @@ def find_approach(
 def opened_pose(
     hand: Hand,
     joints: Float[Tensor, "g h"],
-    obj_from_hand: Float[Tensor, "g 4 4"],
+    obj_from_hand: Poses,
     table: Plane | None,
 ) -> Float[Tensor, "g 4 4"]:
     """Return the poses (g, 4, 4) [m] at which g opened hands end their approach and begin to close.
@@ -108,6 +109,8 @@ def opened_pose(
         joints: joints (g, h) [rad or m] of the opened hands, such as `Grasps.pregrasp`.
         obj_from_hand: poses (g, 4, 4) [m] of the grasps in the object's frame.
         table: the table in the object's frame; None means that no hand is raised.
+
+    Raises `BadArgument` for poses that are not rigid.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

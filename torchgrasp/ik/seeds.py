@@ -28,12 +28,12 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Count, Positive, Seed
 from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
-from torchgrasp.geometry.linalg import dot, eye_like, norm
+from torchgrasp.geometry.linalg import check_unit_vectors, dot, eye_like, norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost, is_world_fused
 from torchgrasp.ik.refine import TIP_WEIGHT
-from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture, check_compatible, encode
+from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture, check_mixture, encode
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.values.planning import Contacts, IKSeeds
 
@@ -239,6 +239,7 @@ def nearest_postures(
             library.
         BadArgument: contacts on another device than the library, or of another number than
             fingertips.
+        BadArgument: normals that are not of length 1 (to 1e-3).
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -257,6 +258,9 @@ def nearest_postures(
             f"{contacts.fingertips} in a row",
             f"{f}, one for each fingertip of the hand",
         )
+    # elsewhere a plan would wait for the device
+    if device.type == "cpu":
+        check_unit_vectors("contacts.normals", contacts.normals)
     permutations = torch.tensor(list(itertools.permutations(range(f))), device=device)
     assignments = min(SEEDS.assignments, len(permutations))
     candidates = min(SEEDS.candidates, assignments * len(given))
@@ -411,9 +415,9 @@ def query_mixture(
     Gaussians of the model that explain the contacts best. The seeds of a contact set are sorted.
     Seeds that touch the surface from outside come first, then the tip error counts. A contact set
     without a reachable assignment has no seeds. Raises `BadArgument` for a model of another hand,
-    joint limits or fingertips.
+    joint limits or fingertips, or in other units.
     """
-    check_compatible(mixture.meta, mixture.joint_names, hand)
+    check_mixture(mixture, hand)
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)
     hand = settle(hand, contacts.points.device)
     mixture = settle(mixture, contacts.points.device)

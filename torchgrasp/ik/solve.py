@@ -18,6 +18,7 @@ from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import ANY
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
+from torchgrasp.geometry.linalg import check_unit_vectors
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.attempts import Attempts, assign
 from torchgrasp.ik.candidates import measure_errors
@@ -127,6 +128,7 @@ def solve_ik(
 
     Raises:
         BadArgument: contacts that are not finite, or not one for each fingertip.
+        BadArgument: normals that are not of length 1 (to 1e-3).
         BadArgument: a mixture of another hand, or an unknown method.
         BadArgument: a mixture or "cobyla" for a hand with more than three fingertips.
 
@@ -138,6 +140,7 @@ def solve_ik(
     """
     check_tensor("contacts.points", contacts.points, (None, len(hand.tips), 3))
     check_tensor("contacts.normals", contacts.normals, (len(contacts), len(hand.tips), 3))
+    check_unit_vectors("contacts.normals", contacts.normals)
     if method == "cobyla":
         hand.require_three("method", "'cobyla'")
     if mixture is not None:

@@ -215,7 +215,7 @@ class Objects:
         return self.specs[0]
 
     @property
-    def slipping(self) -> ContactSpec:
+    def spec_without_margin(self) -> ContactSpec:
         """The constraints on contacts of the first object, but planned with the whole mean
         friction.
 

@@ -99,7 +99,7 @@ def predict(
         center = objects.body.rows(cloud).center
         mass = Distribution.of(task.mass).mean
         carried = carries_weight(
-            objects.hand, grasps, center, mass, objects.slipping, objects.strongest
+            objects.hand, grasps, center, mass, objects.spec_without_margin, objects.strongest
         )
         log_odds = log_odds - UNCARRIED * ~carried
     obstacles = objects.world.obstacles

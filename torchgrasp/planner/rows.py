@@ -370,7 +370,7 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
     weak = torch.zeros_like(found.certificate.margin)
     share = torch.ones_like(seeds.energy)
     if objects.lifts or objects.loads is not None:
-        spec = objects.slipping if objects.loads is None else objects.spec
+        spec = objects.spec_without_margin if objects.loads is None else objects.spec
         share = _carried(objects, found, spec)
         weak = weak.scatter_reduce(0, seeds.row, share, "amax")
         weak = torch.where(weak < 1, CHOICE.weak * (2 - weak), 0.0)

@@ -41,6 +41,7 @@ quantile of chi-square with 6 degrees of freedom.
 """
 # positions, as shares of the joints' ranges, in the postures that identify a hand
 PROBED = (0.2, 0.5, 0.7)
+WIDEST = 1.0  # greatest mean distance [m] of a fingertip from the centroid: no hand is wider
 WRITTEN = 1e-5  # greatest difference [m, or a cosine] of codes written with seven decimals
 
 
@@ -351,6 +352,25 @@ def _map_codes(
     return torch.where(bad.view(bad.shape + (1,) * (y.ndim - bad.ndim)), torch.nan, y)
 
 
+def check_mixture(mixture: GraspMixture, hand: Hand) -> None:
+    """Raise `BadArgument` unless a posture model belongs to a hand (`check_compatible`), and has
+    its units.
+
+    The mean joints must be within the hand's limits, and the mean distances of the fingertips from
+    their centroid within 1 m (`WIDEST`). Otherwise the postures of the training had other units,
+    and no contacts seem to be within reach.
+    """
+    check_compatible(mixture.meta, mixture.joint_names, hand)
+    mean = mixture.mean().detach().to(hand.lower.device)
+    joints, lengths, _ = mean.split([hand.dof, 3, 3])
+    if bool(((joints < hand.lower) | (joints > hand.upper)).any()):
+        found = f"mean joints {[round(x, 3) for x in joints.tolist()]}"
+        raise BadArgument("mixture", found, "joints within the hand's limits, in radians or metres")
+    if not bool(((lengths > 0) & (lengths < WIDEST)).all()):
+        found = f"mean distances {[round(x, 3) for x in lengths.tolist()]} of the fingertips"
+        raise BadArgument("mixture", found, f"distances up to {WIDEST:g} m, in metres")
+
+
 @checked
 def load_mixture(name_or_path: Path | str) -> GraspMixture:
     """Return the learned posture model of a hand, read from a file.
@@ -373,8 +393,7 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
     try:
         names = tuple(meta.pop("names").split())
         regularisation = float(meta.pop("regularisation"))
-        rest = {k: v for k, v in meta.items() if k not in ("kind", "version")}
-        return GraspMixture(**tensors, names=names, regularisation=regularisation, meta=rest)
+        return GraspMixture(**tensors, names=names, regularisation=regularisation, meta=meta)
     except (KeyError, AttributeError, TypeError, ValueError) as error:
         allowed = "a mixture that GraspMixture.save wrote"
         raise ModelFileError("path", f"{path}: {error}", allowed) from error

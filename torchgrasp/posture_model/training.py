@@ -186,6 +186,7 @@ def fit_mixture(
 
     Raises:
         BadArgument: too few samples, or codes of another number of fingers than three.
+        BadArgument: samples without one name for each joint.
         BadArgument: a joint that does not vary, a number out of range, or another fit's checkpoint.
         ModelFileError: a damaged checkpoint.
         OutputError: a checkpoint that cannot be written.
@@ -281,6 +282,9 @@ def standardised_rows(
     if samples.q.shape[1] != len(CODE_NAMES):
         found = f"codes of {samples.q.shape[1]} numbers"
         raise BadArgument("samples", found, "codes of three fingertips: six numbers")
+    if len(samples.joint_names) != samples.joints.shape[1]:
+        found = f"{len(samples.joint_names)} names of {samples.joints.shape[1]} joints"
+        raise BadArgument("samples", found, "one for each")
     # a copy, which is standardised in place
     shard = DataRows.of(samples.rows().double(), distributed)
     n = shard.count()

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.limits import SHOWN_LETTERS
+from torchgrasp.foundation.rules import check_suffix
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.scene.image import read_arrays
 from torchgrasp.scene.masks import read_labels, without_masks
@@ -116,8 +116,7 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
     (1, 2, 3, 4)
     """
     path = Path(path)
-    if path.suffix.lower() != ".npz":
-        raise BadArgument("path", path, "a file ending in .npz")
+    check_suffix("path", path, ".npz")
     labels = scene.pixel_labels.cpu().numpy().astype(np.int32)
     arrays = {
         # a rounded depth could move a pixel beyond a bound, and out of its mask

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchgrasp.cloud.depth import Array, frustum_of_image, read_depth
 from torchgrasp.cloud.lens import describe
 from torchgrasp.cloud.pose import read_camera_pose
+from torchgrasp.cloud.rays import unproject
 from torchgrasp.cloud.safe_files import parse_npz, unread_arrays
 from torchgrasp.files import explain, read_bounded
 from torchgrasp.foundation.base import Value
@@ -129,9 +130,7 @@ class DepthImage(Value):
         k = self.intrinsics.double()
         row = torch.arange(z.shape[0], dtype=z.dtype, device=z.device)[:, None]
         column = torch.arange(z.shape[1], dtype=z.dtype, device=z.device)
-        x = z * (column - k[0, 2]) / k[0, 0]
-        y = z * (row - k[1, 2]) / k[1, 1]
-        camera = torch.stack([x, y, z], -1)
+        camera = unproject(z, k, row, column)
         return apply(self.obj_from_camera.double(), camera.reshape(-1, 3)).reshape(*z.shape, 3)
 
     def at_border(self, pixels: Int[Tensor, "n 2"]) -> bool:

@@ -17,7 +17,7 @@ from torchgrasp.foundation.limits import SHOWN_LETTERS
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane
 from torchgrasp.scene.image import IMAGE, DepthImage
-from torchgrasp.scene.segment import at_one_jump, count_labels, rests_on, segment
+from torchgrasp.scene.segment import above_table_not_flying, count_labels, rests_on, segment
 from torchgrasp.scene.table_image import TableImage
 
 
@@ -59,6 +59,8 @@ class MaskNumbers:
     """
     gained: float = 0.1
     """Least share of a mask's pixels that a shift brings back onto the object, for a note."""
+    nested: float = 0.9
+    """Least share of a mask's pixels in another mask for a note: its border may be off a little."""
     fitting: float = 0.85
     """Least share of the shifted mask's pixels that are on the object, for a note. With less, the
     mask has another shape.
@@ -91,6 +93,17 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
 
     Raises `BadArgument` for anything else.
     """
+    return read_told_labels(labels, shape, name)[0]
+
+
+def read_told_labels(
+    labels: Any, shape: tuple[int, ...], name: str = "labels"
+) -> tuple[Int[Tensor, "..."], tuple[str, ...]]:
+    """Return the labels of `read_labels`, and notes, a sentence for each mask that others cut.
+
+    Of a mask within another one, both stay objects. So a mask of a part, such as a handle, cuts its
+    object in two.
+    """
     if isinstance(labels, Mapping) and "annotations" in labels:
         labels = labels["annotations"]
         _check_one_image(labels, name)
@@ -101,11 +114,10 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
             raise BadArgument(
                 name, f"{count} values, as of a photograph", f"at most {MASKS.most_labels} objects"
             )
-        return read
+        return read, ()
     if len(masks) > MASKS.most_labels:
         raise BadArgument(name, f"{len(masks)} masks", f"at most {MASKS.most_labels}")
-    stack = torch.zeros(shape, dtype=torch.long)
-    size = torch.zeros(shape, dtype=torch.long)
+    several = list[Tensor]()
     for k, mask in enumerate(masks, start=1):
         read = _read_one(mask, shape, name)
         inside = read > 0
@@ -113,11 +125,30 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
             found = f"mask {k} with numbers from {int(values.min())} to {int(values.max())}"
             whole = "masks of one number beside 0, as mask > 127; labels (h, w); colours (h, w, 3)"
             raise BadArgument(name, found, whole)
-        own = int(inside.sum())
-        above = inside & ((stack == 0) | (own <= size))
-        stack[above] = k
-        size[above] = own
-    return stack
+        several.append(inside)
+    return _stack(several, shape)
+
+
+def _stack(
+    masks: list[Tensor], shape: tuple[int, ...]
+) -> tuple[Int[Tensor, "..."], tuple[str, ...]]:
+    """Return labels 1, 2, ... of masks, the smaller above the larger, and notes on nested ones."""
+    stack = torch.zeros(shape, dtype=torch.long)
+    within = dict[int, list[int]]()
+    sizes = [int(mask.sum()) for mask in masks]
+    # the largest first; of equal ones the last is above
+    for k in sorted(range(len(masks)), key=lambda k: (-sizes[k], k)):
+        below = count_labels(stack[masks[k]], len(masks) + 1)
+        outer = 1 + int(below[1:].argmax())
+        if sizes[k] and int(below[outer]) >= MASKS.nested * sizes[k]:
+            within.setdefault(outer, []).append(k + 1)
+        stack[masks[k]] = k + 1
+    notes = list[str]()
+    for outer, inner in sorted(within.items()):
+        parts = ", ".join(map(str, sorted(inner)))
+        found = f"objects {parts} lie within it, and count as other objects"
+        notes.append(f"{_mask_name(outer)}: {found}: leave out the masks of its parts")
+    return stack, tuple(notes)
 
 
 def _masks(labels: Any, shape: tuple[int, ...]) -> Any:
@@ -325,7 +356,7 @@ def _trim_labels(
                 f"{_mask_name(k)}: its other {rest} pixels were removed, too: it is the support"
             )
             kept = torch.where(kept == k, 0, kept)
-    if not bool((kept > 0).any()):
+    if not (kept > 0).any():
         raise BadArgument(
             "labels", "none that rises above the table", "labels of objects on the table"
         )
@@ -381,7 +412,7 @@ def label_again(
         elif names[k] > 0 and 2 * int(shared[k].max()) > int((labels == names[k]).sum()):
             best = shared[k].argmax()
             number[best] = torch.where(number[best] > names[-1], names[k], number[best])
-    if bool(own.any()) and not bool((labels[~own] > 0).any()):
+    if own.any() and not (labels[~own] > 0).any():
         return kept
     found = _beside(found, kept > 0, own, belongs)
     return torch.where(kept > 0, kept, torch.where(found > 0, number[found], 0))
@@ -404,7 +435,7 @@ def _on_objects(view: TableImage, labels: Int[Tensor, "h w"]) -> Bool[Tensor, "h
     that lose the other pixels lose none when they are read again.
     """
     sure = rests_on(view)
-    beside = at_one_jump(view) & ~sure
+    beside = above_table_not_flying(view) & ~sure
     names, own = labels.unique(return_inverse=True)
     more = count_labels(own[beside], len(names))
     thin = more > MASKS.thin * (more + count_labels(own[sure], len(names)))

@@ -287,7 +287,7 @@ def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     """
     device = scene.points.device
     scene = settle(scene, torch.device("cpu"))
-    if not bool(scene.rows_of(target).any()):
+    if not scene.rows_of(target).any():
         raise BadArgument("target", target, f"one of the labels {scene.things}")
     things = scene.labels > 0
     if scene.table is not None:

@@ -37,7 +37,7 @@ from torchgrasp.scene.image import (
     read_image,
 )
 from torchgrasp.scene.leaning import tell_leaning
-from torchgrasp.scene.masks import label_image, read_labels, read_mask
+from torchgrasp.scene.masks import label_image, read_labels, read_mask, read_told_labels
 from torchgrasp.scene.merge import find_touching
 from torchgrasp.scene.segment import find_components
 from torchgrasp.scene.table_image import TableImage
@@ -175,7 +175,8 @@ class Scene(Value):
                 - an image (h, w) of whole numbers, where 0 means no object;
                 - a picture (h, w, 3 or 4) with a colour for each object, where black and
                   transparent mean no object;
-                - a list of masks, where a smaller mask lies above a larger one;
+                - a list of masks, where a smaller mask lies above a larger one. A note tells of
+                  a mask within another one, which is perhaps a part of it;
                 - COCO's run lengths {"size": [h, w], "counts": ...}, or COCO's dict with a list of
                   "annotations".
             point: a place on the target, as a pixel (u, v), column first, or a point (x, y, z) [m].
@@ -198,7 +199,10 @@ class Scene(Value):
             raise BadArgument("mask", "a mask beside labels or a point", "one of them")
         image = read_image(depth, intrinsics, camera_pose, depth_unit)
         inside = None if mask is None else read_mask(mask, tuple(image.depth.shape))
-        given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
+        given = None
+        nested = ()
+        if labels is not None:
+            given, nested = read_told_labels(labels, tuple(image.depth.shape))
         points = image.points()
         measured = image.depth > 0
         try:
@@ -215,6 +219,7 @@ class Scene(Value):
                 raise NoSupport("table", error.found, f"{error.allowed}; {rays[0]}") from None
             raise
         found, notes = label_image(TableImage(image, points, supports[0]), given, inside)
+        notes = (*nested, *notes)
         if table is None and depth_unit is None:
             notes += check_sizes(
                 points[measured], found[measured], image.obj_from_camera, supports[0].plane
@@ -309,7 +314,7 @@ class Scene(Value):
             if corners.shape != (2, 3):
                 raise BadArgument("box", f"shape {tuple(corners.shape)}", "two corners (2, 3)")
             inside = ((points >= corners.amin(0)) & (points <= corners.amax(0))).all(-1)
-            if not bool(inside.any()):
+            if not inside.any():
                 raise BadArgument("box", "no point inside", "one that holds the target")
         supports = find_table(points, viewpoint, table, up, _target(points, inside))
         planes = tuple(support.plane for support in supports)
@@ -371,7 +376,7 @@ class Scene(Value):
                 raise BadArgument("target", target, f"a label of an object: {list(self.things)}")
             return self._aimed(target)
         place = torch.as_tensor(np.asarray(target), dtype=torch.float64)
-        if place.shape not in ((2,), (3,)) or not bool(torch.isfinite(place).all()):
+        if place.shape not in ((2,), (3,)) or not torch.isfinite(place).all():
             raise BadArgument("point", repr(target), "a pixel (u, v) or a point (x, y, z)")
         if len(place) == 2:
             offset = self.pixels.double() - place.flip(0)
@@ -506,7 +511,7 @@ class Scene(Value):
         depth = self.image.depth.cpu().double()
         own = labels == (self.target or 0)
         others = (labels > 0) & ~own
-        if self.target is None or not bool(others.any()):
+        if self.target is None or not others.any():
             return {}
         inner: Any = ndimage.binary_erosion(own.numpy())
         outline = own & ~torch.from_numpy(inner)
@@ -599,7 +604,7 @@ class Scene(Value):
         """
         rows = self.rows_of(label)
         frustum = self.image.frustum
-        if not bool(rows.any()):
+        if not rows.any():
             found = f"{label if label is not None else self.target}, of which no point is seen"
             raise BadArgument("label", found, f"one of {list(self.things)}")
         sides = None if frustum is None else frustum.to(self.points)
@@ -663,7 +668,7 @@ class _Borders:
 
 def _target(points: Points, inside: Tensor | None) -> Target | None:
     """Return the target that a mask shows, `inside` (n,) of the `points` (n, 3) [m], or None."""
-    if inside is None or not bool(inside.any()):
+    if inside is None or not inside.any():
         return None
     own = points[inside]
     return Target(own[:: 1 + len(own) // SCENE.drawn])

@@ -154,7 +154,7 @@ def _risen(view: TableImage) -> Bool[Tensor, "h w"]:
     return smooth.measured & (view.mean_height > least) & (smooth.height > SEGMENT.own * least)
 
 
-def at_one_jump(view: TableImage) -> Bool[Tensor, "h w"]:
+def above_table_not_flying(view: TableImage) -> Bool[Tensor, "h w"]:
     """Return a mask of the pixels above the table, without flying pixels: those beside at most one
     jump of depth.
 
@@ -304,7 +304,7 @@ def _is_noise(view: TableImage, deviations: Tensor, labels: Int[Tensor, "h w"], 
     near = torch.from_numpy(ndimage.binary_dilation(mine.numpy(), iterations=margin))
     large = count_labels(labels)[labels[box]] > SEGMENT.larger * int(mine.sum())
     around = near & (labels[box] > 0) & ~mine & large
-    if not bool(around.any()):
+    if not around.any():
         return False
     points = view.points[box]
     return float(torch.cdist(points[around], points[mine]).min()) < MERGE.reach

@@ -112,7 +112,7 @@ class TableImage(Value):
         It is 1.4826 times the median of |mean height| / depth^2 over the pixels on the table
         (`flat`). A few outliers do not move it. It is 0 if no pixel shows the table.
         """
-        if not bool(self.flat.any()):
+        if not self.flat.any():
             return 0.0
         relative = (self.mean_height.abs() / self.image.depth.square())[self.flat]
         return HEIGHT.normal * float(relative.median())

@@ -14,7 +14,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, map_tensors
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.fused import is_fused
+from torchgrasp.foundation.rules import is_known
 from torchgrasp.geometry.linalg import Points, cholesky, norm
 from torchgrasp.shape.estimate import Observations
 from torchgrasp.shape.kernel import Kernel, covariance_rows, cross_covariance, gram, is_thin
@@ -23,6 +25,8 @@ from torchgrasp.shape.posterior import Posterior
 Criterion = Literal["variance", "error", "both"]
 # factor that lowers a bound on distances by more than rounding
 BELOW = 1.0 - 1e-9
+# least covariance of neighbouring points, as a share of the variance, of a kernel that is of use
+TIED = 0.05
 
 
 def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
@@ -55,6 +59,29 @@ def check_kernel(posterior: Posterior, least_noise: float) -> None:
         # greater noise of some observations can hide an indefinite K
         matrix.diagonal().add_(least_noise**2)
         cholesky(matrix, "the covariance K", kernel.remedy)
+
+
+def check_reach(posterior: Posterior) -> None:
+    """Raise `BadArgument` for a kernel so short that neighbouring points are almost independent.
+
+    The covariance at the median distance of nearest neighbours is then below a twentieth of the
+    variance (`TIED`). The surface would be known at its points alone, as with a length in metres.
+    """
+    x = posterior.x
+    if not is_known(x) or len(x) < 2:
+        return
+    x = x.detach()
+    away = torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist")
+    away.fill_diagonal_(torch.inf)
+    near = away.amin(1).median()
+    (covariance,) = posterior.kernel.derivatives(torch.stack([torch.zeros_like(near), near]), 1)
+    if is_known(covariance) and float(covariance[1].detach()) < TIED * float(
+        covariance[0].detach()
+    ):
+        share = float((covariance[1] / covariance[0]).detach())
+        found = f"one whose covariance {float(near):.3g} apart is {share:.2g} of its variance"
+        allowed = "a longer one: its distances are normalised, one unit is the shape's scale"
+        raise BadArgument("kernel", found, allowed)
 
 
 def longest_distance(x: Points) -> float:

@@ -124,21 +124,6 @@ class Observations(Batch):
         every = torch.cat([self.distance_noise, self.normal_noise[self.has_normal]])
         return float(every.detach().min())
 
-    def check_normals(self) -> None:
-        """Raise `BadArgument` if the length of an observed normal is not near 1.
-
-        Lengths from 0.5 to 2 (`LENGTHS`) are taken, as an optimiser changes them a little. Normals
-        of other lengths, such as those weighted by the areas of a mesh's faces, would stretch all
-        distances.
-        """
-        if not (is_known(self.normal) and is_known(self.has_normal)):
-            return
-        length = norm(self.normal.detach()[self.has_normal])
-        wrong = length[(length < LENGTHS[0]) | (length > LENGTHS[1])]
-        if len(wrong):
-            found = f"a vector of length {float(wrong[0]):.4g}"
-            raise BadArgument("observations.normal", found, "unit vectors")
-
     def with_normals_first(self) -> "Observations":
         """Return the same observations in another order: those with normals come first.
 
@@ -146,6 +131,31 @@ class Observations(Batch):
         others, the order is kept.
         """
         return self[torch.argsort(~self.has_normal, stable=True)]
+
+
+def check_observations(observations: Observations, name: str = "observations") -> None:
+    """Raise `BadArgument` if the length of an observed normal is not near 1, or a standard
+    deviation of the noise is negative. The error calls the observations `name`.
+
+    Lengths from 0.5 to 2 (`LENGTHS`) are taken, as an optimiser changes them a little. Normals
+    of other lengths, such as those weighted by the areas of a mesh's faces, would stretch all
+    distances.
+    """
+    observed = observations.has_normal
+    noises = {"distance_noise": observations.distance_noise}
+    if is_known(observed):
+        noises["normal_noise"] = observations.normal_noise[observed]
+    for field, noise in noises.items():
+        if is_known(noise) and bool((noise.detach() < 0).any()):
+            found = f"a standard deviation of {float(noise.detach().min()):.4g}"
+            raise BadArgument(f"{name}.{field}", found, "at least 0")
+    if not (is_known(observations.normal) and is_known(observed)):
+        return
+    length = norm(observations.normal.detach()[observed])
+    wrong = length[(length < LENGTHS[0]) | (length > LENGTHS[1])]
+    if len(wrong):
+        found = f"a vector of length {float(wrong[0]):.4g}"
+        raise BadArgument(f"{name}.normal", found, "unit vectors")
 
 
 def on_surface(

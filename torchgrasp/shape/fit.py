@@ -36,11 +36,18 @@ from torchgrasp.shape.conditioning import (
     Criterion,
     append_observations,
     check_kernel,
+    check_reach,
     longest_distance,
     posterior_given,
     select_points,
 )
-from torchgrasp.shape.estimate import Normalisation, Observations, off_surface, on_surface
+from torchgrasp.shape.estimate import (
+    Normalisation,
+    Observations,
+    check_observations,
+    off_surface,
+    on_surface,
+)
 from torchgrasp.shape.extra_observations import (
     NOISE,
     OUTSIDE,
@@ -298,6 +305,8 @@ def _fit_surface(seen: PreparedCloud, support: ExtraObservations, options: FitOp
     for part, shared in support.parts:
         posterior = append_observations(posterior, part, shared)
     check_kernel(posterior, every.least_noise)
+    if isinstance(options.kernel, Kernel):
+        check_reach(posterior)
     shape = ShapeGP.of(posterior, support.frame, cloud, psi, support.std_factor)
     shape = dataclasses.replace(shape, kind=support.kind)
     free, least = support.free or (x[:0], x[:0, 0])
@@ -341,7 +350,8 @@ def condition(
 
     Raises:
         BadArgument: an unknown kernel; torch.vmap that maps over points or `has_normal`.
-        BadArgument: an observed normal that is no unit vector.
+        BadArgument: an observed normal that is no unit vector, or a negative noise.
+        BadArgument: a `Kernel` so short that neighbouring points are almost independent.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise. Inside
             torch.vmap it is not raised, and the estimate is NaN.
 
@@ -356,12 +366,14 @@ def condition(
         if not is_known(getattr(observations, name)):
             allowed = "the same for all that vmap maps over"
             raise BadArgument(f"observations.{name}", "a tensor inside torch.vmap", allowed)
-    observations.check_normals()
+    check_observations(observations)
     observations = observations.to(normalisation.center.device, torch.float64)
     psi = psi_scale * longest_distance(observations.x)
     posterior = posterior_given(observations, kernel_of(kernel, psi))
     if is_known(posterior.factor):
         check_kernel(posterior, observations.least_noise)
+    if isinstance(kernel, Kernel):
+        check_reach(posterior)
     return ShapeGP.of(posterior, normalisation, cloud, psi, std_factor)
 
 

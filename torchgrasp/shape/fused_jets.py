@@ -4,20 +4,14 @@ The functions take the arguments and return the results of those of the same nam
 """
 
 import math
-from functools import partial
 
-import numpy as np
-from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.fused import array, compiled, inlined
 from torchgrasp.geometry.fused_vectors import put
 from torchgrasp.geometry.linalg import Points
-from torchgrasp.shape.jets import Explain, Weighted
-from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries
-
-Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, float]
-"""Observed points (3, n), weights (1 or q, n) of distances and (1 or q, 3, n) of normals, and psi."""
+from torchgrasp.shape.jets import Arrays, Explain, Weighted, arrays_of
+from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries, psi_of
 
 
 def evaluate_mean(of: Weighted, x: Queries, gradient: bool) -> tuple[Tensor, ...]:
@@ -75,30 +69,6 @@ def _mean(arrays: Arrays, x: Queries, bent: bool) -> tuple[Tensor, Tensor, Tenso
     found = x.new_empty(len(x)), x.new_empty(len(x), 3), x.new_empty(len(x) * bent, 3, 3)
     _sum_at(array(x), *arrays, *(y.numpy() for y in found))
     return found
-
-
-def arrays_of(
-    of: Weighted,
-    a: Float[Tensor, "#q n"],
-    b: Float[Tensor, "#q 3 near"],
-) -> Arrays:
-    """Return (points, a, b, psi) as NumPy arrays and a number, in the form that compiled loops
-    take.
-
-    They are the observed points (3, n) and the kernel's length psi, both of `of`, and the given
-    weights. All q query points share the weights `a` of distances and `b` of normals, or each has
-    its own. Weights of normals become (1 or q, 3, n); points without normals get 0.
-    """
-    shifts = a.new_zeros(len(b), 3, len(of.x))  # points without normals have weight 0
-    shifts[..., : b.shape[2]] = b
-    return array(of.x.T), array(a), array(shifts), psi_of(of.kernel)
-
-
-def psi_of(kernel: Kernel) -> float:
-    """Return the normalised length psi of a thin plate kernel."""
-    form = kernel.closed_form
-    assert isinstance(form, partial)
-    return float(form.args[0])
 
 
 @inlined

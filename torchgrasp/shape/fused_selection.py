@@ -10,7 +10,7 @@ from torchgrasp.foundation.fused import array, compiled, inlined
 from torchgrasp.geometry.fused_vectors import dot, factorise, minus
 from torchgrasp.geometry.linalg import cholesky
 from torchgrasp.shape.estimate import Observations
-from torchgrasp.shape.fused_jets import psi_of
+from torchgrasp.shape.kernel import psi_of
 from torchgrasp.shape.posterior import Posterior
 
 

@@ -36,6 +36,7 @@ from torchgrasp.shape.estimate import (
     Normalisation,
     Observations,
     ShapeDerivatives,
+    check_observations,
     on_surface,
     surface_deviation,
 )
@@ -430,9 +431,13 @@ class ShapeGP(Posterior, Normalisation):
         Kernel, `cloud` and the domain do not change. The domain is the ball in which the posterior
         is valid. `update` does the same for points [m].
 
-        Raises `IndefiniteCovariance` if the covariance of the observations is not positive
-        definite. It may be so for observations far outside the domain.
+        Raises `BadArgument` for an observed normal that is no unit vector: one of twice the length
+        would stretch distances. Raises `IndefiniteCovariance` if the covariance of the observations
+        is not positive definite. It may be so for observations far outside the domain.
         """
+        # elsewhere a plan would wait for the device
+        if new.x.device.type == "cpu":
+            check_observations(new, "new")
         return dataclasses.replace(self, **common_fields(append_observations(self, new), Posterior))
 
     @checked

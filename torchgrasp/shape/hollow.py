@@ -217,8 +217,9 @@ class HollowShape(ShapeGP):
         cavity. The observed normal points there, too, away from the material. `cloud` and the
         domain, the ball in which the posterior is valid, do not change.
 
-        Raises `IndefiniteCovariance` if the covariance of the observations is not positive
-        definite. It may be so for observations far outside the domain.
+        Raises `BadArgument` for an observed normal that is no unit vector. Raises
+        `IndefiniteCovariance` if the covariance of the observations is not positive definite. It
+        may be so for observations far outside the domain.
         """
         outer, inner = self.wall_at(new.x).T
         new_outer = self.outer.append(new[outer])

@@ -6,14 +6,18 @@
 import dataclasses
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.foundation.fused import array
 from torchgrasp.geometry.linalg import Points
-from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries, separations
+from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries, psi_of, separations
+
+Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+"""Observed points (3, n), weights (1 or q, n) of distances and (1 or q, 3, n) of normals, and psi."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,7 +36,7 @@ class Weighted:
     kernel: Kernel  # covariance of the signed distances at two points
 
     @cached_property
-    def arrays(self) -> Any:
+    def arrays(self) -> Arrays:
         """The NumPy arrays (points, a, b, psi) that the compiled loops take, computed once.
 
         They are the observed points (3, n), and the weights (1, n) of distances and (1, 3, n) of
@@ -40,9 +44,24 @@ class Weighted:
         normalised. Ask for them only if all query points share one posterior with a thin plate
         kernel.
         """
-        from torchgrasp.shape import fused_jets  # it imports numba
+        return arrays_of(self, self.a[None], self.b.mT[None])
 
-        return fused_jets.arrays_of(self, self.a[None], self.b.mT[None])
+
+def arrays_of(
+    of: Weighted,
+    a: Float[Tensor, "#q n"],
+    b: Float[Tensor, "#q 3 near"],
+) -> Arrays:
+    """Return (points, a, b, psi) as NumPy arrays and a number, in the form that compiled loops
+    take.
+
+    They are the observed points (3, n) and the kernel's length psi, both of `of`, and the given
+    weights. All q query points share the weights `a` of distances and `b` of normals, or each has
+    its own. Weights of normals become (1 or q, 3, n); points without normals get 0.
+    """
+    shifts = a.new_zeros(len(b), 3, len(of.x))  # points without normals have weight 0
+    shifts[..., : b.shape[2]] = b
+    return array(of.x.T), array(a), array(shifts), psi_of(of.kernel)
 
 
 # `Posterior.explain`: function of covariances (q, r) with all observed numbers, which returns (the

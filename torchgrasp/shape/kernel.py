@@ -239,6 +239,13 @@ def is_thin(kernel: Kernel) -> bool:
     return isinstance(form, partial) and form.func is differentiate_thin_plate
 
 
+def psi_of(kernel: Kernel) -> float:
+    """Return the normalised length psi of a thin plate kernel."""
+    form = kernel.closed_form
+    assert isinstance(form, partial)
+    return float(form.args[0])
+
+
 def differentiate_thin_plate(
     psi: float | Tensor,
     r: Tensor,

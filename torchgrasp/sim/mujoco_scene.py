@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from torchgrasp.files import render
-from torchgrasp.foundation.errors import HandFileError, MissingExtra
+from torchgrasp.foundation.errors import HandFileError
+from torchgrasp.foundation.lazy import import_extra
 from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.urdf import Joint, Link, Urdf
 from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, SceneSpec, pair_masks
@@ -194,11 +195,7 @@ def import_mujoco() -> Any:
 
     Raises `MissingExtra` if MuJoCo is not installed.
     """
-    try:
-        import mujoco
-    except ImportError as error:
-        raise MissingExtra("mujoco", "mujoco") from error
-    engine: Any = mujoco
+    engine = import_extra("mujoco", "mujoco", "mujoco")
     if engine.get_mju_user_warning() is None:
         engine.set_mju_user_warning(lambda text: None)
     return engine

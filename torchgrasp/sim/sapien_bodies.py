@@ -9,6 +9,8 @@ Settings that differ from SAPIEN's defaults:
   names.
 * Sleeping is off, because a sleeping body keeps stale contacts.
 * The object's inertia is set with its mass.
+* A link without <inertial> adds almost nothing to the link to which it is fixed. SAPIEN takes the
+  density of water, and a moment of inertia of 1e-6 kg m^2 or more.
 * Penetrations are resolved at 1 m/s at most.
 * The solver is PGS: with TGS a held object creeps, far inside the friction cones. Only TGS knows
   contact patches; with 32 iterations a step the object creeps slower than with 10.
@@ -27,8 +29,10 @@ from typing import Any
 import numpy as np
 
 from torchgrasp.files import temporary_folder, write_file
-from torchgrasp.foundation.errors import MissingExtra
-from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.errors import MendedInput
+from torchgrasp.foundation.lazy import import_extra, trimesh
+from torchgrasp.foundation.told import warn_user
+from torchgrasp.hand.urdf import Urdf
 from torchgrasp.sim.scene_spec import (
     ARMATURE,
     MOUNT_DRIVE,
@@ -56,6 +60,10 @@ class BodyNumbers:
     """Largest number of vertices of a hull of which PhysX keeps all: its limit is 255 faces."""
     foot: int = 100
     """Number of lowest vertices of a larger hull that make a shape of their own."""
+    least_mass: float = 1e-6
+    """Mass [kg] of a link that has none: PhysX takes no zero."""
+    least_inertia: float = 1e-9
+    """Moment of inertia [kg m^2] of this link about every axis."""
 
 
 BODIES = BodyNumbers()
@@ -190,6 +198,7 @@ def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
     loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
     with temporary_folder() as folder:
         hand = loader.load(str(write_file(folder / "hand.urdf", mounted_urdf(spec))))
+    _set_missing_masses(hand, spec.urdf)
     slides = {slide.name: slide for slide in spec.slides}
     spec.check_drives([j.name for j in hand.active_joints if j.name not in slides])
     start = []
@@ -218,17 +227,39 @@ def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
     return hand
 
 
+def _set_missing_masses(hand: Any, urdf: Urdf) -> None:
+    """Make links without mass as light as PhysX allows, in SAPIEN's articulation of a hand.
+
+    Fixed joints make groups of links that move as one body. `MendedInput` warns of a group in which
+    no link has a mass: SAPIEN then takes that of water in its shapes.
+    """
+    heads = dict[str, str]()  # the first link of each link's group
+    for link in urdf.links:
+        above = (joint.child for joint in urdf.joints_above(link.name) if joint.kind != "fixed")
+        heads[link.name] = next(above, urdf.root)
+    masses = dict.fromkeys(heads.values(), 0.0)
+    masses[urdf.root] = 1.0  # that of the mount
+    for link in urdf.links:
+        masses[heads[link.name]] += link.mass
+    missing = [link.name for link in urdf.links if link.mass == 0]
+    light = [name for name in missing if masses[heads[name]] > 0]
+    for link in hand.links:
+        if link.name in light:
+            link.mass = BODIES.least_mass
+            link.inertia = np.full(3, BODIES.least_inertia, np.float32)
+    bodies = [head for head, mass in masses.items() if mass == 0]
+    if bodies:
+        found = f"links without mass ({', '.join(bodies)}), which are simulated as of water"
+        warn_user(MendedInput, f"{urdf.path}: {found}; give each an <inertial>")
+
+
 def import_sapien() -> tuple[Any, Any]:
     """Import and return the modules (`sapien`, `sapien.physx`).
 
     SAPIEN's warning about missing Vulkan is hidden, because physics works without Vulkan. Raises
     `MissingExtra` if SAPIEN is not installed.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import sapien
-            import sapien.physx as physx
-    except ImportError as error:
-        raise MissingExtra("sapien", "sim") from error
-    return sapien, physx
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        engine = import_extra("sapien", "sim", "sapien")
+        return engine, import_extra("sapien.physx", "sim", "sapien")

@@ -3,14 +3,17 @@
 import math
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.load import check_named
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import (
@@ -44,6 +47,8 @@ SENTENCES = {
 """What is said of each cause; the names of features stand for their values. "task" is the last."""
 MOST = 3
 """Most causes that are told."""
+SLACK = 0.02
+"""Greatest median distance [m] of the contacts from the surface, which a second view may move."""
 ROUNDING = 1e-9
 """A probability up to this counts as 0."""
 
@@ -92,7 +97,9 @@ def explain_success(
         shape: the estimated shape of the object (`fit_shape`), in the frame of the grasps.
         task: what the grasp must do; None means `GraspTask()`.
 
-    Raises `BadArgument` for no grasps, or grasps of another planner.
+    Raises `BadArgument` for no grasps, or grasps of another planner. It is raised for a hand or
+    fingers that the grasps do not name. It is also raised for a shape whose surface is more than
+    20 mm (`SLACK`) from half of the contacts, as in another frame.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -107,6 +114,8 @@ def explain_success(
             "grasps", f"{len(grasps)} grasps, planned for no friction", "grasps of plan_grasps"
         )
     task = GraspTask() if task is None else task
+    check_named(hand, grasps)
+    _check_shape(grasps[0], shape)
     stood = stand_upright(grasps[0], hand, shape)
     features = measure_again(*stood, task)
     carried = _is_carried(*stood, task)
@@ -139,6 +148,21 @@ def explain_success(
     others = [cost for cost in lower if cost.cause != given.cause]
     kept = [*others[: MOST - 1], said]
     return tuple(sorted(kept, key=lambda cost: -cost.log_odds))
+
+
+def _check_shape(grasp: Grasps, shape: ShapeGP) -> None:
+    """Raise `BadArgument` if half of a grasp's contacts are off the surface of a shape [m]."""
+    points = grasp.contacts.points[0].double().to(shape.device)
+    allowed = "the shape of the grasped object, in the frame of the grasps"
+    away = norm(points - shape.center)
+    if bool((away > 2 * shape.domain_radius * shape.scale).any()):
+        found = f"one whose centre is {float(away.max()):.3g} m from a contact"
+        raise BadArgument("shape", found, allowed)
+    known = shape.predict(points, covariance=False)
+    off = float((known.distance.abs() * shape.scale).median())
+    if off > SLACK:
+        found = f"one whose surface is {1e3 * off:.0f} mm off the contacts"
+        raise BadArgument("shape", found, allowed)
 
 
 def conditions_of(grasps: Grasps, task: GraspTask) -> Conditions:
@@ -182,11 +206,12 @@ def stand_upright(grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[Hand, Est
     frame, with z up.
 
     The `shape` of the object is in the frame of the grasps. Up is the normal of the grasps' table,
-    or without a table the direction to the camera. The hand is moved to the device and dtype of the
-    grasps.
+    or without a table the direction to the camera. The hand is moved to the device of the
+    grasps. All is in float64: float32 is too coarse to prove that forces carry a load.
     """
     frame = inverse(upright_frame(shape.cloud.points, shape.cloud.viewpoint, grasps.table))
-    hand = hand.to(grasps.joints.device, grasps.joints.dtype)
+    grasps = grasps.to(torch.float64)
+    hand = hand.to(grasps.joints.device, torch.float64)
     return hand, EstimatedBody.of(shape.moved(frame)), move(grasps, frame)
 
 

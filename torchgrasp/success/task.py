@@ -15,6 +15,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Force
 from torchgrasp.geometry.frames import apply, real, rotate
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.distribution import Distribution, check_within
@@ -202,6 +203,8 @@ class TaskWrenches(Value):
 class TaskNumbers:
     """Loads of the named tasks, and the directions of pushes."""
 
+    farthest: float = 2.0
+    """Greatest distance [m] of the point of a load from the object's centre."""
     push: float = 2.5
     """Force [N] of each push in the named tasks."""
     around: float = 1.24
@@ -245,6 +248,9 @@ def loads_of(
         upright_from_obj: transform from the cloud's frame, in which `TaskWrenches` are, to the
             upright frame.
         table: whether a table is known; without one, named loads take the cloud's z axis for up.
+
+    Raises `BadArgument` for a point of `TaskWrenches` more than 2 m (`TASKS.farthest`) from the
+    centre: it is in another frame, or in millimetres.
     """
     if isinstance(resist, TaskWrenches):
         vectors = rotate(upright_from_obj, resist.wrenches.to(center).reshape(-1, 3))
@@ -254,6 +260,11 @@ def loads_of(
             if resist.point is None
             else apply(upright_from_obj, resist.point.to(center)[None])[0]
         )
+        away = float(norm(point - center))
+        if away > TASKS.farthest:
+            found = f"a point {away:.4g} m from the object's centre"
+            allowed = f"one within {TASKS.farthest:g} m, in metres and in the frame of the cloud"
+            raise BadArgument("resist.point", found, allowed)
     else:
         names = (resist,) if isinstance(resist, str) else resist
         loads = _named_loads(mass)

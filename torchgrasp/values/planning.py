@@ -11,9 +11,8 @@ friction-cone edges, h actuated joints, and t time steps.
 
 import copy
 import dataclasses
-import importlib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -358,6 +357,18 @@ class Probabilities(Tensor):
         return self.as_subclass(Tensor).__reduce_ex__(proto)
 
 
+class NotebookPages(Protocol):
+    """What draws grasps for notebooks: `torchgrasp.app.report.notebook`."""
+
+    def make_sheet(self, grasps: "Grasps", cloud: Any, hand: Any) -> Any:
+        """Return what `Grasps.show` returns for these grasps, cloud and hand."""
+        ...
+
+    def show_in_notebook(self, grasps: "Grasps") -> str:
+        """Return the HTML that a notebook shows of the grasps."""
+        ...
+
+
 @checked
 @dataclasses.dataclass(frozen=True)
 class Grasps(Batch):
@@ -430,6 +441,8 @@ class Grasps(Batch):
     interval: Annotated[Float[Tensor, "g 2"], ANY] | None = None
     arm: Float[Tensor, "g n"] | None = None
     ease: Float[Tensor, "g 2"] | None = None
+    # the package gives it, as the stage that draws is a later one
+    pages: ClassVar[NotebookPages]
 
     @property
     def success(self) -> Float[Tensor, "g"]:
@@ -493,11 +506,11 @@ class Grasps(Batch):
 
         Raises `BadArgument` for another hand, or for a cloud that the grasps do not touch.
         """
-        return _pages().make_sheet(self, cloud, hand)
+        return self.pages.make_sheet(self, cloud, hand)
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows of the grasps."""
-        return _pages().show_in_notebook(self)
+        return self.pages.show_in_notebook(self)
 
     @checked
     def save(self, path: Path | str) -> None:
@@ -506,14 +519,6 @@ class Grasps(Batch):
         Raises `OutputError` if the file cannot be written.
         """
         save_tensors(path, "grasps", named_tensors(self), self.meta)
-
-
-def _pages() -> Any:
-    """Return the module that draws grasps.
-
-    It is of a later stage, so it is found when asked for.
-    """
-    return importlib.import_module("torchgrasp.app.report.notebook")
 
 
 def format_success(success: "Grasps | float") -> str:

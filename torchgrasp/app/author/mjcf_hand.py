@@ -63,9 +63,9 @@ class ModelHand:
         self.names = names_of(model, "body", model.nbody)
         self.joint_names = names_of(model, "joint", model.njnt)
         kinds = mujoco.mjtJoint
-        self.slides = [kind == int(kinds.mjJNT_SLIDE) for kind in model.jnt_type.tolist()]
-        self.free = [kind == int(kinds.mjJNT_FREE) for kind in model.jnt_type.tolist()]
-        scalar = {int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE)}
+        self.slides = [kind == kinds.mjJNT_SLIDE for kind in model.jnt_type.tolist()]
+        self.free = [kind == kinds.mjJNT_FREE for kind in model.jnt_type.tolist()]
+        scalar = kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE
         self.scalar = [kind in scalar for kind in model.jnt_type.tolist()]
         # how each actuator drives, and the joint, tendon or site that it drives
         self.transmissions = model.actuator_trntype.tolist()
@@ -182,16 +182,16 @@ class ModelHand:
         target = self.targets[actuator]
         row = np.zeros(model.njnt)
         gear = float(model.actuator_gear[actuator, 0])
-        if kind in (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)):
+        if kind in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT):
             row[target] = gear
-        elif kind == int(kinds.mjTRN_TENDON):
+        elif kind == kinds.mjTRN_TENDON:
             row = gear * self._tendon(target)
         return row
 
     def _is_fixed(self, tendon: int) -> bool:
         first = int(self.model.tendon_adr[tendon])
         kind = int(self.model.wrap_type[first])
-        return kind == int(self.mujoco.mjtWrap.mjWRAP_JOINT)
+        return kind == self.mujoco.mjtWrap.mjWRAP_JOINT
 
     def _tendon(self, tendon: int) -> np.ndarray:
         """Return the coefficients of a fixed tendon for all joints, zero for a spatial one."""
@@ -241,12 +241,12 @@ class ModelHand:
         model = self.model
         kinds = self.mujoco.mjtTrn
         base = self.root or -1
-        plain = {int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT), int(kinds.mjTRN_TENDON)}
+        plain = kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT, kinds.mjTRN_TENDON
         names = names_of(model, "actuator", model.nu)
         for k, (kind, target) in enumerate(zip(self.transmissions, self.targets, strict=True)):
-            if kind in plain or kind == int(kinds.mjTRN_BODY):
+            if kind in plain or kind == kinds.mjTRN_BODY:
                 continue
-            if kind == int(kinds.mjTRN_SITE):
+            if kind == kinds.mjTRN_SITE:
                 body = int(model.site_bodyid[target])
                 # thrust on the floating base moves no finger
                 if body == base or body not in self.bodies:
@@ -258,13 +258,13 @@ class ModelHand:
         """Raise `HandFileError` for spatial tendons that move the hand."""
         model = self.model
         names = names_of(model, "tendon", model.ntendon)
-        by_tendon = int(self.mujoco.mjtTrn.mjTRN_TENDON)
+        by_tendon = self.mujoco.mjtTrn.mjTRN_TENDON
         drives = zip(self.transmissions, self.targets, strict=True)
         by_motor = [target for kind, target in drives if kind == by_tendon]
-        ties = int(self.mujoco.mjtEq.mjEQ_TENDON)
+        ties = self.mujoco.mjtEq.mjEQ_TENDON
         tied = []
         for k in range(model.neq):
-            if int(model.eq_type[k]) == ties and bool(model.eq_active0[k]):
+            if model.eq_type[k] == ties and model.eq_active0[k]:
                 tied += [int(model.eq_obj1id[k]), int(model.eq_obj2id[k])]
         for k in range(model.ntendon):
             if self._is_fixed(k):
@@ -285,12 +285,12 @@ class ModelHand:
         inside[self.joints] = True
         for k in range(model.neq):
             kind = int(model.eq_type[k])
-            if not bool(model.eq_active0[k]):
+            if not model.eq_active0[k]:
                 continue
-            if kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
+            if kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
                 self._check_loop(k, names[k])
                 continue
-            if kind not in (int(kinds.mjEQ_JOINT), int(kinds.mjEQ_TENDON)):
+            if kind not in (kinds.mjEQ_JOINT, kinds.mjEQ_TENDON):
                 continue
             one = int(model.eq_obj1id[k])
             two = int(model.eq_obj2id[k])
@@ -316,7 +316,7 @@ class ModelHand:
         value in the reference posture.
         """
         model = self.model
-        if kind == int(self.mujoco.mjtEq.mjEQ_TENDON):
+        if kind == self.mujoco.mjtEq.mjEQ_TENDON:
             return self._tendon(index), float(model.tendon_length0[index])
         row = np.zeros(model.njnt)
         row[index] = 1.0
@@ -327,7 +327,7 @@ class ModelHand:
         model = self.model
         allowed = 'a straight line: polycoef="a b 0 0 0"'
         called = f"equality {name} of tendons"
-        if kind == int(self.mujoco.mjtEq.mjEQ_JOINT):
+        if kind == self.mujoco.mjtEq.mjEQ_JOINT:
             called = f"equality {name} of {self.joint_names[one]} to {self.joint_names[two]}"
             low, high = model.jnt_range[two].tolist()
             if low < high:
@@ -345,7 +345,7 @@ class ModelHand:
         """Raise `HandFileError` for an equality that closes a loop of bodies of the hand."""
         model = self.model
         both = [int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])]
-        if int(model.eq_objtype[equality]) == int(self.mujoco.mjtObj.mjOBJ_SITE):
+        if model.eq_objtype[equality] == self.mujoco.mjtObj.mjOBJ_SITE:
             both = [int(model.site_bodyid[site]) for site in both]
         if all(body in self.bodies and body > 0 for body in both):
             found = f"equality {name} that closes a loop of bodies"
@@ -373,7 +373,7 @@ class ModelHand:
                 most += max(ends[1], 0.0)
                 least += min(ends[0], 0.0)
             effort = max(most, -least) if known else 0.0
-            if bool(model.jnt_actfrclimited[j]):
+            if model.jnt_actfrclimited[j]:
                 strongest = float(np.abs(model.jnt_actfrcrange[j]).max())
                 effort = min(effort or math.inf, strongest)
             low, high = self._range(j, pulls[:, column])
@@ -401,12 +401,12 @@ class ModelHand:
     def _force(self, actuator: int) -> tuple[float, float]:
         """Return the least and the greatest force of an actuator [N or N m]; zeros if unknown."""
         model = self.model
-        if bool(model.actuator_forcelimited[actuator]):
+        if model.actuator_forcelimited[actuator]:
             low, high = np.asarray(model.actuator_forcerange[actuator]).tolist()
             return low, high
-        direct = int(model.actuator_gaintype[actuator]) == int(self.mujoco.mjtGain.mjGAIN_FIXED)
-        plain = int(model.actuator_biastype[actuator]) == int(self.mujoco.mjtBias.mjBIAS_NONE)
-        if direct and plain and bool(model.actuator_ctrllimited[actuator]):
+        direct = model.actuator_gaintype[actuator] == self.mujoco.mjtGain.mjGAIN_FIXED
+        plain = model.actuator_biastype[actuator] == self.mujoco.mjtBias.mjBIAS_NONE
+        if direct and plain and model.actuator_ctrllimited[actuator]:
             gain = float(model.actuator_gainprm[actuator][0])
             low, high = np.asarray(model.actuator_ctrlrange[actuator]).tolist()
             return gain * low, gain * high
@@ -417,7 +417,7 @@ class ModelHand:
         ones.
         """
         model = self.model
-        if bool(model.jnt_limited[joint]):
+        if model.jnt_limited[joint]:
             low, high = np.asarray(model.jnt_range[joint]).tolist()
             return low, high
         for k in np.flatnonzero(arms).tolist():
@@ -435,16 +435,16 @@ class ModelHand:
         model = self.model
         gain = float(model.actuator_gainprm[actuator][0])
         start, slope = np.asarray(model.actuator_biasprm[actuator][:2], dtype=float).tolist()
-        affine = int(model.actuator_biastype[actuator]) == int(self.mujoco.mjtBias.mjBIAS_AFFINE)
-        fixed = int(model.actuator_gaintype[actuator]) == int(self.mujoco.mjtGain.mjGAIN_FIXED)
+        affine = model.actuator_biastype[actuator] == self.mujoco.mjtBias.mjBIAS_AFFINE
+        fixed = model.actuator_gaintype[actuator] == self.mujoco.mjtGain.mjGAIN_FIXED
         if not (affine and fixed and gain > 0 and slope < 0):
             return None
         ends = model.actuator_ctrlrange[actuator]
-        limited = bool(model.actuator_ctrllimited[actuator])
+        limited = model.actuator_ctrllimited[actuator]
         # the control of an integrator is a speed, and its state is the position
-        if int(model.actuator_dyntype[actuator]) == int(self.mujoco.mjtDyn.mjDYN_INTEGRATOR):
+        if model.actuator_dyntype[actuator] == self.mujoco.mjtDyn.mjDYN_INTEGRATOR:
             ends = model.actuator_actrange[actuator]
-            limited = bool(model.actuator_actlimited[actuator])
+            limited = model.actuator_actlimited[actuator]
         if not limited:
             return None
         low, high = ((gain * np.asarray(ends, dtype=float) + start) / -slope).tolist()
@@ -506,7 +506,7 @@ class ModelHand:
         model = self.model
         names = names_of(model, "tendon", model.ntendon)
         for k in range(model.ntendon):
-            if bool(model.tendon_limited[k]) and self._is_fixed(k):
+            if model.tendon_limited[k] and self._is_fixed(k):
                 ends = np.asarray(model.tendon_range[k]).tolist()
                 what = f"the limits of tendon {names[k]}"
                 self._narrow(drives, self._tendon(k), ends, mechanism, what)

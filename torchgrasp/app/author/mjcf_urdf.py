@@ -88,7 +88,7 @@ class UrdfWriter:
             pose = np.eye(4)
             before = at
         if not own:
-            self._fixed(unused_name(f"{name}_fixed", set(hand.joint_names)), parent, name, pose)
+            self._connect(unused_name(f"{name}_fixed", set(hand.joint_names)), parent, name, pose)
 
     def _add_sites(self, tips: Sequence[str]) -> None:
         """Add the sites at fingertips, and those that `tips` name, as links."""
@@ -103,14 +103,17 @@ class UrdfWriter:
             self.links.add(name)
             ET.SubElement(self.robot, "link", name=name)
             pose = _shift(-self.offset[body]) @ _pose(model.site_pos[k], model.site_quat[k])
-            self._fixed(f"{name}_site", self.hand.names[body], name, pose)
+            self._connect(f"{name}_site", self.hand.names[body], name, pose)
 
-    def _fixed(self, name: str, parent: str, child: str, pose: np.ndarray) -> None:
-        """Add a fixed joint."""
-        element = ET.SubElement(self.robot, "joint", name=name, type="fixed")
+    def _connect(
+        self, name: str, parent: str, child: str, pose: np.ndarray, kind: str = "fixed"
+    ) -> ET.Element:
+        """Add a joint without axis and limits, and return its element."""
+        element = ET.SubElement(self.robot, "joint", name=name, type=kind)
         _origin(element, pose)
         ET.SubElement(element, "parent", link=parent)
         ET.SubElement(element, "child", link=child)
+        return element
 
     def _joint(self, joint: int, parent: str, child: str, pose: np.ndarray) -> None:
         """Add a joint; `pose` is that of its frame in the parent at its reference."""
@@ -122,7 +125,7 @@ class UrdfWriter:
         rest = float(model.qpos0[model.jnt_qposadr[joint]])
         if name in still:
             move = _move(slides, axis, still[name] - rest)
-            self._fixed(name, parent, child, pose @ move)
+            self._connect(name, parent, child, pose @ move)
             return
         drive = self.drives[joint]
         kind = "prismatic" if slides else "revolute"
@@ -131,10 +134,7 @@ class UrdfWriter:
             bounds = {"lower": _number(drive.lower), "upper": _number(drive.upper)}
         elif not slides:
             kind = "continuous"
-        element = ET.SubElement(self.robot, "joint", name=name, type=kind)
-        _origin(element, pose @ _move(slides, axis, -rest))
-        ET.SubElement(element, "parent", link=parent)
-        ET.SubElement(element, "child", link=child)
+        element = self._connect(name, parent, child, pose @ _move(slides, axis, -rest), kind)
         ET.SubElement(element, "axis", xyz=_text(axis))
         limit = {"effort": _number(drive.effort), "velocity": "0"}
         ET.SubElement(element, "limit", limit | bounds)
@@ -177,21 +177,21 @@ class UrdfWriter:
         kind = int(model.geom_type[geom])
         x, y, z = np.asarray(model.geom_size[geom], dtype=float).tolist()
         here = np.zeros(3)
-        if kind == int(kinds.mjGEOM_BOX):
+        if kind == kinds.mjGEOM_BOX:
             return [("box", {"size": _text(np.array([2 * x, 2 * y, 2 * z]))}, here)]
-        if kind == int(kinds.mjGEOM_SPHERE):
+        if kind == kinds.mjGEOM_SPHERE:
             return [("sphere", {"radius": _number(x)}, here)]
-        if kind in (int(kinds.mjGEOM_CYLINDER), int(kinds.mjGEOM_CAPSULE)):
+        if kind in (kinds.mjGEOM_CYLINDER, kinds.mjGEOM_CAPSULE):
             shapes = [("cylinder", {"radius": _number(x), "length": _number(2 * y)}, here)]
-            if kind == int(kinds.mjGEOM_CAPSULE):
+            if kind == kinds.mjGEOM_CAPSULE:
                 for end in (-y, y):
                     shapes.append(("sphere", {"radius": _number(x)}, np.array([0.0, 0.0, end])))
             return shapes
         name = f"geom{geom}.stl"
-        if kind == int(kinds.mjGEOM_ELLIPSOID):
+        if kind == kinds.mjGEOM_ELLIPSOID:
             surface = trimesh.creation.icosphere(FINENESS)
             surface.apply_scale([x, y, z])
-        elif kind == int(kinds.mjGEOM_MESH):
+        elif kind == kinds.mjGEOM_MESH:
             mesh = int(model.geom_dataid[geom])
             name = f"mesh{mesh}.stl"
             corner = int(model.mesh_vertadr[mesh])

@@ -5,7 +5,7 @@ Every step returns the repaired URDF and a sentence for each repair.
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -192,7 +192,7 @@ def _heavier(link: Link, other: Link) -> Link:
     inertia = np.zeros((3, 3))
     for part in parts:
         arm = np.array(part.com) - com
-        inertia += _matrix(part.inertia) + part.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        inertia += part.inertia_matrix + part.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     x, y, z = com.tolist()
     mass = link.mass + other.mass
     return Link(link.name, mass, (x, y, z), _triangle(inertia), link.shapes)
@@ -217,7 +217,7 @@ def _moved(link: Link, pose: np.ndarray) -> Link:
         xyz, rpy = place(pose @ pose_of(shape))
         shapes.append(dataclasses.replace(shape, xyz=xyz, rpy=rpy))
     x, y, z = (turn @ link.com + pose[:3, 3]).tolist()
-    inertia = _triangle(turn @ _matrix(link.inertia) @ turn.T)
+    inertia = _triangle(turn @ link.inertia_matrix @ turn.T)
     return Link(link.name, link.mass, (x, y, z), inertia, tuple(shapes))
 
 
@@ -432,7 +432,7 @@ def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
         if not mass > 0:
             mass = max(REPAIRS.least_mass, REPAIRS.density * float(np.prod(high - low)))
             weightless.append(f"{link.name} ({1e3 * mass:.3g} g)")
-        principal = np.linalg.eigvalsh(_matrix(link.inertia))
+        principal = np.linalg.eigvalsh(link.inertia_matrix)
         # of any body, two principal moments add up to the third or more
         largest = principal[2] * (1 - REPAIRS.rounding)
         sound = principal[0] > 0 and principal[0] + principal[1] >= largest
@@ -455,11 +455,6 @@ def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
             "size and mass get those of their bounding box"
         )
     return dataclasses.replace(urdf, links=tuple(links)), done
-
-
-def _matrix(inertia: Collection[float]) -> np.ndarray:
-    xx, xy, xz, yy, yz, zz = inertia
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _triangle(inertia: np.ndarray) -> tuple[float, ...]:

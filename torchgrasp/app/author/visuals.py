@@ -43,7 +43,8 @@ def link_meshes(path: Path, data: bytes, folder: Path) -> dict[str, Triangles]:
 
     A mesh is its corners (v, 3) [m] in the link's frame, and its faces (t, 3), indices of corners.
     Where it has more than 2000 faces (`VISUAL.most_faces`), near corners are joined. A link is left
-    out if one of its visuals is missing, malformed or too large. `path` and `data` are the path and
+    out if one of its visuals is missing, malformed or too large. It is too large, too, if all
+    meshes kept so far leave no place for it (`HAND_MESH_BYTES`). `path` and `data` are the path and
     the bytes of the URDF; mesh files lie inside `folder`.
     """
     found = {}
@@ -54,15 +55,16 @@ def link_meshes(path: Path, data: bytes, folder: Path) -> dict[str, Triangles]:
         parts = []
         try:
             for shape in shapes:
-                mesh = _mesh_of(path, data, shape, folder)
-                size += mesh.vertices.nbytes + mesh.faces.nbytes
-                parts.append(mesh)
+                parts.append(_mesh_of(path, data, shape, folder))
         except GraspError:
             continue
         whole: Any = trimesh.util.concatenate(parts)
         reach = float(np.abs(whole.vertices).max())
-        if size > HAND_MESH_BYTES or not reach <= MAX_EXTENT:
+        own = sum(part.vertices.nbytes + part.faces.nbytes for part in parts)
+        # a link that is left out takes no place of the others
+        if size + own > HAND_MESH_BYTES or not reach <= MAX_EXTENT:
             continue
+        size += own
         found[link] = _thinned(np.asarray(whole.vertices), np.asarray(whole.faces))
     return found
 

@@ -85,14 +85,14 @@ def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
         middle = centre.double().expand(len(closure.time), 1, 3)
         world = apply(closure.object_pose.double(), middle)[:, 0]  # (t, 3)
         away = norm(world - world[0]) > PUSHED_DISTANCE
-        return int(away.int().argmax()) if bool(away.any()) else last
+        return int(away.int().argmax()) if away.any() else last
     # else it slipped too far, or at most one finger still touched it: the earlier of both
     distance, angle = moved_in_hand(closure, centre)
     gone = (distance > SLIP_DISTANCE) | (angle > SLIP_ANGLE)
     gone[: pressed + 1] = False
     held = torch.nonzero(touching(closure).sum(1) >= 2)
     let_go = min(int(held[-1]) + 1, last) if len(held) else pressed
-    return min(let_go, int(gone.int().argmax()) if bool(gone.any()) else last)
+    return min(let_go, int(gone.int().argmax()) if gone.any() else last)
 
 
 def explain_loss(
@@ -145,7 +145,7 @@ def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) ->
         return ""
     name = fingers[finger]
     time = float(closure.time[begin])
-    if not bool(touched[begin, finger]):
+    if not touched[begin, finger]:
         return f"{name} let go first, at {time:.2f} s"
     force = closure.trace.forces[begin, finger]
     normal = closure.trace.normals[begin, finger]
@@ -178,7 +178,7 @@ def moments_of(
     all_touch = len(closure.contact_order) == len(fingers)
     ends = ((1, "all touch" if all_touch else "the closing ends"), (2, "pressed"))
     for k, name in ends:
-        if bool(closure.phases[k].isfinite()):
+        if closure.phases[k].isfinite():
             found.append(Moment(tick_of(closure, k), name))
     lost = find_loss(closure, centre)
     if lost is not None:

@@ -10,10 +10,10 @@ from torch import Tensor
 from torchgrasp.app.report import canvas as paint
 from torchgrasp.app.report.raster import Direction
 from torchgrasp.app.report.solids import link_poses, place_solids
-from torchgrasp.app.report.stills import add_solids, to_array
+from torchgrasp.app.report.stills import add_solids
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.geometry.frames import apply, real, rotate
+from torchgrasp.geometry.frames import apply, real, rotate, to_array
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosureResult

@@ -18,10 +18,9 @@ from torchgrasp.app.report.closing_moments import (
 )
 from torchgrasp.app.report.closing_pictures import draw_ticks, finite_ticks
 from torchgrasp.app.report.raster import Direction
-from torchgrasp.app.report.stills import to_array
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.geometry.frames import apply
+from torchgrasp.geometry.frames import apply, to_array
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand

@@ -11,12 +11,13 @@ import numpy as np
 from torchgrasp.app.report.canvas import OBJECT, color_std, rgb
 from torchgrasp.app.report.raster import FULL
 from torchgrasp.app.report.solids import link_poses, solids_by_link
-from torchgrasp.app.report.stills import mesh_arrays, to_array
+from torchgrasp.app.report.stills import mesh_arrays
 from torchgrasp.cloud.agreement import check_contacts
 from torchgrasp.control.reference import check_single
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.lazy import spatial, trimesh
+from torchgrasp.geometry.frames import to_array
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values.planning import Grasps

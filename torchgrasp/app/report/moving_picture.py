@@ -22,7 +22,7 @@ from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError, one_line
 from torchgrasp.foundation.lazy import Image, trimesh
-from torchgrasp.foundation.rules import Range
+from torchgrasp.foundation.rules import Range, check_suffix
 from torchgrasp.geometry.frames import inverse, real
 from torchgrasp.geometry.plane import as_plane, move, upright_frame, upright_table
 from torchgrasp.hand.hand import Hand
@@ -109,8 +109,7 @@ def check_kind(path: Path) -> None:
     """Raise `BadArgument` for a path that ends neither in .gif nor in .mp4. For .mp4, raise
     `MissingExtra` if ffmpeg is not installed.
     """
-    if path.suffix.lower() not in KINDS:
-        raise BadArgument("path", path, f"a file that ends in {' or '.join(KINDS)}")
+    check_suffix("path", path, *KINDS)
     if path.suffix.lower() == ".mp4":
         find_ffmpeg()
 

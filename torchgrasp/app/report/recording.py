@@ -15,15 +15,13 @@ from torchgrasp.app.report.closing_moments import mass_centre, moments_of
 from torchgrasp.app.report.raster import FULL
 from torchgrasp.app.report.run_data import Run
 from torchgrasp.app.report.solids import link_poses, solids_by_link
-from torchgrasp.app.report.stills import mesh_arrays, to_array
+from torchgrasp.app.report.stills import mesh_arrays
 from torchgrasp.app.report.viewer import POSTURES, pose_postures
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import MissingExtra
-from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.foundation.lazy import import_extra, spatial
+from torchgrasp.geometry.frames import apply, inverse, rotate, to_array
 from torchgrasp.geometry.mesh import with_true_normals
-from torchgrasp.geometry.plane import upright_frame
 
 ROOT = "world/obj"  # entity of the frame of the cloud, in which all poses of grasps are
 CLOUD_COLOR = "#c2452d"  # seen before the light colours of surface and object
@@ -75,10 +73,7 @@ def write_recording(path: Path | str, run: Run) -> Path:
 
 def import_rerun() -> Any:
     """Return the module `rerun`; raise `MissingExtra` if it is not installed."""
-    try:
-        return importlib.import_module("rerun")
-    except ImportError as error:
-        raise MissingExtra("rerun", "rerun") from error
+    return import_extra("rerun", "rerun", "rerun")
 
 
 class _Recorder:
@@ -103,7 +98,7 @@ class _Recorder:
         """Log frames, cloud and surface, and the contacts and postures of the best grasp."""
         rr = self.rr
         run = self.run
-        frame = inverse(upright_frame(run.cloud.points, run.cloud.viewpoint, run.spec.plane))
+        frame = inverse(run.obj_from_upright)
         self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         at = {"translation": to_array(frame[:3, 3]), "quaternion": _quaternions(frame)}
         self._log(ROOT, rr.Transform3D(**at))

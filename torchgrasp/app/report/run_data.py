@@ -9,6 +9,7 @@ from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import inverse, real
 from torchgrasp.geometry.plane import move, upright_frame, upright_table
 from torchgrasp.hand.hand import Hand
@@ -104,6 +105,11 @@ class Run:
         """
         return bool(self.closure.held) if self.closure is not None else len(self.executable) > 0
 
+    @property
+    def obj_from_upright(self) -> Pose:
+        """The pose (4, 4) [m] of the frame of `upright` in the frame of the cloud."""
+        return upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
+
     def upright(self) -> "Run":
         """Return the run in a frame whose z axis points up.
 
@@ -114,7 +120,7 @@ class Run:
         Raises `BadArgument` if the `executable` grasps do not touch the mesh. It is also raised if
         the table is above most points of the cloud.
         """
-        obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
+        obj_from_upright = self.obj_from_upright
         upright_from_obj = inverse(obj_from_upright)
         mesh = self.mesh
         closure = self.closure
@@ -224,7 +230,7 @@ def refusal(run: Run) -> str:
     if len(run.grasps):
         failed = run.grasps.status
         total = f"{len(run.grasps)} postures"
-    elif run.plan is not None and not bool((run.plan.status == Status.OK).any()):
+    elif run.plan is not None and not (run.plan.status == Status.OK).any():
         failed = run.plan.status
         total = f"{len(run.plan)} starts"
     else:

@@ -152,8 +152,8 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
     finger_of = {}
     for mine, name in zip(moves, hand.tree.link_names, strict=True):
         # a finger owns the links whose joints all move its tip; no joint moves the palm
-        owners = [f for f in range(len(hand.tips)) if bool(moves[hand.tips.index[f]][mine].all())]
-        finger_of[name] = owners[0] if bool(mine.any()) and len(owners) == 1 else PARKED
+        owners = [f for f in range(len(hand.tips)) if moves[hand.tips.index[f]][mine].all()]
+        finger_of[name] = owners[0] if mine.any() and len(owners) == 1 else PARKED
     return finger_of
 
 

@@ -17,6 +17,7 @@ from torchgrasp.app.report.raster import Direction
 from torchgrasp.app.report.solids import PARKED, Solid, finger_of_links, solids_from_hand
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import Image
+from torchgrasp.geometry.frames import to_array
 from torchgrasp.geometry.linalg import dot, norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
@@ -276,11 +277,6 @@ def rotated(direction: Direction, degrees: float) -> Direction:
     c = np.cos(np.deg2rad(degrees))
     s = np.sin(np.deg2rad(degrees))
     return (float(c * x - s * y), float(s * x + c * y), z)
-
-
-def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
-    """Return a tensor of any shape and device as a NumPy array in float64, without its gradient."""
-    return value.detach().cpu().double().numpy()
 
 
 def mesh_arrays(surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -26,14 +26,14 @@ from torchgrasp.app.report.page import TEMPLATES, encode_base64, render
 from torchgrasp.app.report.raster import FULL
 from torchgrasp.app.report.run_data import Run, grasp_columns, grasp_rows, verdict
 from torchgrasp.app.report.solids import link_poses, solids_of_links
-from torchgrasp.app.report.stills import facing, mesh_arrays, to_array, view_of
+from torchgrasp.app.report.stills import facing, mesh_arrays, view_of
 from torchgrasp.cloud.agreement import check_seen
 from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.data.accept import CloudLike, HandLike, as_cloud
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
-from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.geometry.plane import Plane, upright_frame
+from torchgrasp.geometry.frames import apply, inverse, rotate, to_array
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
@@ -178,7 +178,7 @@ def describe(run: Run) -> dict[str, Any]:
 
     All are in a frame where z is up, in metres (`Run.upright`).
     """
-    frame = inverse(upright_frame(run.cloud.points, run.cloud.viewpoint, run.spec.plane))
+    frame = inverse(run.obj_from_upright)
     sentence = verdict(run)
     run = run.upright()
     best = run.executable[: VIEWER.grasps]

@@ -333,7 +333,7 @@ class Impedance:
         """Return the frame of the triangle of fingertips [m], or the last valid frame if the tips
         are on a line.
         """
-        if not bool(degenerate(tips)):
+        if not degenerate(tips):
             self.frame = virtual_frame(tips)
         return self.frame
 

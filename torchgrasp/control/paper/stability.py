@@ -170,9 +170,7 @@ def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel
             )
             for k in ("stable", "others")
         )
-        model = StabilityModel(
-            stable, others, share, {k: v for k, v in meta.items() if k not in ("kind", "version")}
-        )
+        model = StabilityModel(stable, others, share, meta)
     except (KeyError, AttributeError, ValueError) as error:
         raise ModelFileError(
             "path", f"{path}: {error}", "a model that StabilityModel.save wrote"
