@@ -75,7 +75,7 @@ def lift_objects(o: Options, hand: Hand, protocol: Protocol, simulator: str) -> 
         if o.names and not here:
             continue
         spec = EvaluationSpec(
-            1, starts=o.starts, only=here, seed=o.seed, views=1, planned=_kept(shelf)
+            1, starts=o.starts, only=here, seed=o.seed, views=1, planned=_kept(shelf, here)
         )
         found += evaluate(folder, hand, protocol, spec, folder=shelf, workers=o.workers)
     return found
@@ -86,9 +86,12 @@ def names_in(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(sorted({*names} & {*read_entries(folder)}))
 
 
-def _kept(shelf: Path) -> bool:
-    """Return whether a folder has grasps."""
-    return any(shelf.glob("*/*.safetensors"))
+def _kept(shelf: Path, names: Sequence[str]) -> bool:
+    """Return whether a folder has the grasps of all named objects.
+
+    After a run that was cut off it has those of some. Then all are planned again.
+    """
+    return all(any((shelf / name).glob("*.safetensors")) for name in names)
 
 
 def _row(what: str, scores: Sequence[ViewScore], least: float, strict: float) -> Row:
