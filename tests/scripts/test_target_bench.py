@@ -79,14 +79,15 @@ def test_the_middle_of_a_mask_is_farthest_from_its_rim():
 
 
 def test_a_refused_click_counts_as_asked_and_a_lost_target_does_not():
-    held = TargetTry(0, "can", 2, 0.0, "click", 1.0, 1.0, 5, 0.9, "OK", 0.0)
-    lost = TargetTry(1, "cup", 2, 0.5, "click", 1.0, 1.0, 5, 0.8, "DROPPED", 0.03)
+    held = TargetTry(0, "can", 2, 0.0, "click", 1.0, 1.0, 5, 0.9, "OK", 0.0, True)
+    lost = TargetTry(1, "cup", 2, 0.5, "click", 1.0, 1.0, 5, 0.8, "DROPPED", 0.03, True)
     refused = TargetTry(2, "jar", 3, 0.9, "click", said="too few pixels", clear=1)
     rows = {row.what: row for row in describe("click", [held, lost, refused])}
     assert (
         "held 33.3 %" in rows["target by click"].measured
         and "asked 66.7 %" in rows["target by click"].measured
     )
+    assert rows["target by click, up to three grasps"].measured.startswith("held 66.7 %")
     assert rows["a neighbour moved by more than 2 cm, click"].measured.startswith("50.0 %")
     assert rows["predicted minus held, click"].measured.startswith("+0.350")
     assert "0.33 to 0.67: 0 held, 0 without a grasp of 1" in (
