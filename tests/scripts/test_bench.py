@@ -13,6 +13,7 @@ import torch
 import trimesh
 from bench import SUBJECTS
 from benchmarks import common
+from benchmarks.close.table_lift import are_kept
 from benchmarks.common import Options, Row, benches_of, keep_rows, measure, write_section
 from benchmarks.ground_truth import read_views, sample_hidden
 from benchmarks.headline.shapes import measure_shape
@@ -177,3 +178,12 @@ def test_fit_factor_is_the_spread_of_normal_errors(spread: float):
     generator = np.random.default_rng(0)
     views = [spread * np.abs(generator.standard_normal(4000)) for _ in range(12)]
     assert fit_factor(views) == pytest.approx(spread, abs=0.03)
+
+
+def test_grasps_are_kept_only_if_every_object_has_some(tmp_path):
+    assert not are_kept(tmp_path, ["cup", "pan"])
+    (tmp_path / "cup").mkdir()
+    (tmp_path / "cup" / "view0.safetensors").touch()
+    # a run that was cut off
+    assert not are_kept(tmp_path, ["cup", "pan"])
+    assert are_kept(tmp_path, ["cup"])

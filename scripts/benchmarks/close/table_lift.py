@@ -7,7 +7,7 @@ grasp fails.
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,9 +74,8 @@ def lift_objects(o: Options, hand: Hand, protocol: Protocol, simulator: str) -> 
         here = names_in(folder, o.names)
         if o.names and not here:
             continue
-        spec = EvaluationSpec(
-            1, starts=o.starts, only=here, seed=o.seed, views=1, planned=_kept(shelf, here)
-        )
+        planned = are_kept(shelf, here or read_entries(folder))
+        spec = EvaluationSpec(1, starts=o.starts, only=here, seed=o.seed, views=1, planned=planned)
         found += evaluate(folder, hand, protocol, spec, folder=shelf, workers=o.workers)
     return found
 
@@ -86,7 +85,7 @@ def names_in(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(sorted({*names} & {*read_entries(folder)}))
 
 
-def _kept(shelf: Path, names: Sequence[str]) -> bool:
+def are_kept(shelf: Path, names: Iterable[str]) -> bool:
     """Return whether a folder has the grasps of all named objects.
 
     After a run that was cut off it has those of some. Then all are planned again.
