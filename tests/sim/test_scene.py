@@ -14,6 +14,7 @@ from torchgrasp import load_hand
 from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.sim.mujoco_scene import OBJECT
+from torchgrasp.sim.sapien_bodies import CENTIMETRES
 from torchgrasp.sim.scene_spec import (
     APPROACH_JOINT,
     LIFT_JOINT,
@@ -95,7 +96,8 @@ def support(scene):
     """Return the force [N] with which all contacts hold up the object."""
     if hasattr(scene, "data"):  # MuJoCo
         return float(scene.data.joint(OBJECT).qfrc_constraint[2])
-    impulse = sum(np.asarray(p.impulse) for c in scene.system.get_contacts() for p in c.points)
+    contacts = scene.system.get_contacts()
+    impulse = sum(np.asarray(p.impulse) for c in contacts for p in c.points) / CENTIMETRES
     return abs(float(np.asarray(impulse)[2])) / scene.timestep
 
 
@@ -120,8 +122,8 @@ def test_scene_object_has_the_inertia_of_its_mesh(simulator):
     mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
     *_, scene = build("barrett", mesh, simulator)
     if simulator == "sapien":
-        inertia = scene.body.inertia
-        centre = np.asarray(scene.body.cmass_local_pose.p)
+        inertia = scene.body.inertia / CENTIMETRES**2
+        centre = np.asarray(scene.body.cmass_local_pose.p) / CENTIMETRES
         frame = scene.body.cmass_local_pose.to_transformation_matrix()[:3, :3]
     else:
         body = scene.model.body("torchgrasp_object")

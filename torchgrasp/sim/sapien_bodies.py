@@ -14,8 +14,9 @@ Settings that differ from SAPIEN's defaults:
 * Penetrations are resolved at 1 m/s at most.
 * The solver is PGS: with TGS a held object creeps, far inside the friction cones. Only TGS knows
   contact patches; with 32 iterations a step the object creeps slower than with 10.
-* Convex parts are cooked at a larger scale. The foot of a finely faceted part is a shape of its
-  own.
+* Lengths are in centimetres, the unit `CENTIMETRES`. PhysX is made for things of a metre: in metres
+  it misses whole contacts of a fingertip with a convex part, and drops vertices. The foot of a
+  finely faceted part is a shape of its own.
 
 A `material` is PhysX's material of a surface, with its friction.
 """
@@ -52,14 +53,12 @@ class BodyNumbers:
     """
     iterations: int = 32
     """Iterations of the solver for positions in each step; with more, held objects creep less."""
-    scale: float = 0.01
-    """Ratio of true lengths to those of the shapes that PhysX prepares. PhysX drops vertices within
-    0.7 mm of a hull.
-    """
     hull: int = 129
     """Largest number of vertices of a hull of which PhysX keeps all: its limit is 255 faces."""
     foot: int = 100
     """Number of lowest vertices of a larger hull that make a shape of their own."""
+    depenetration: float = 1.0
+    """Greatest speed [m/s] at which PhysX moves overlapping bodies apart."""
     least_mass: float = 1e-6
     """Mass [kg] of a link that has none: PhysX takes no zero."""
     least_inertia: float = 1e-9
@@ -67,6 +66,10 @@ class BodyNumbers:
 
 
 BODIES = BodyNumbers()
+CENTIMETRES = 100.0
+"""PhysX's units of length in a metre. Masses and times keep their units, so forces and impulses are
+as many times as large, and torques and moments of inertia its square.
+"""
 
 
 def open_world(gravity: float, timestep: float, patches: bool) -> tuple[Any, Any]:
@@ -78,9 +81,11 @@ def open_world(gravity: float, timestep: float, patches: bool) -> tuple[Any, Any
     """
     sapien, physx = import_sapien()
     physx.set_scene_config(
-        gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=patches, enable_pcm=True
+        gravity=np.array([0, 0, -CENTIMETRES * gravity], np.float32),
+        enable_tgs=patches,
+        enable_pcm=True,
     )
-    physx.set_shape_config(contact_offset=BODIES.contact_offset, rest_offset=0.0)
+    physx.set_shape_config(contact_offset=CENTIMETRES * BODIES.contact_offset, rest_offset=0.0)
     physx.set_body_config(
         solver_position_iterations=BODIES.iterations,
         solver_velocity_iterations=1,
@@ -110,7 +115,7 @@ def place(scene: Any, name: str, body: Any, height: float = 0.0) -> None:
     entity = sapien.Entity()
     entity.name = name
     entity.add_component(body)
-    entity.set_pose(sapien.Pose([0.0, 0.0, height]))
+    entity.set_pose(sapien.Pose([0.0, 0.0, CENTIMETRES * height]))
     scene.add_entity(entity)
 
 
@@ -130,15 +135,15 @@ def table(material: Any, spec: SceneSpec) -> Any:
         top.set_local_pose(sapien.Pose(q=[half, 0.0, -half, 0.0]))
     else:
         ledge = spec.ledge
-        box = trimesh.creation.box(2 * ledge.half)
+        box = trimesh.creation.box(2 * CENTIMETRES * ledge.half)
         corners = box.vertices.astype(np.float32)
         faces = box.faces.astype(np.uint32)
         scale = np.ones(3, np.float32)
         top = physx.PhysxCollisionShapeTriangleMesh(corners, faces, scale, material)
         frame = np.eye(4)
         frame[:3, :3] = ledge.axes
-        frame[:2, 3] = ledge.centre[:2]
-        frame[2, 3] = -ledge.half[2]
+        frame[:2, 3] = CENTIMETRES * ledge.centre[:2]
+        frame[2, 3] = -CENTIMETRES * ledge.half[2]
         top.set_local_pose(sapien.Pose(frame))
     body.attach(top)
     return body
@@ -150,27 +155,23 @@ def rigid_body(material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: fl
     `spec` gives mass, centre of mass and inertia, and `material` is PhysX's surface material.
     `hulls` are the vertices (v, 3) [m] of each hull, in the frame of `spec.mesh`. `patch` [m] is
     the radius of contact patches.
-
-    PhysX drops vertices within 0.7 mm of the hull of the others. Therefore this function passes the
-    hulls a hundred times as large, with a scale of 1/100.
     """
     sapien, physx = import_sapien()
-    scale = BODIES.scale
     body = physx.PhysxRigidDynamicComponent()
     for vertices in (some for hull in hulls for some in split_hull(hull)):
-        scaled = (vertices / scale).astype(np.float32)
-        shape = physx.PhysxCollisionShapeConvexMesh(scaled, np.full(3, scale, np.float32), material)
-        shape.min_patch_radius = patch
+        corners = (CENTIMETRES * vertices).astype(np.float32)
+        shape = physx.PhysxCollisionShapeConvexMesh(corners, np.ones(3, np.float32), material)
+        shape.min_patch_radius = CENTIMETRES * patch
         body.attach(shape)
     moments, axes = np.linalg.eigh(spec.inertia)
     axes = axes * np.array([1.0, 1.0, np.sign(np.linalg.det(axes))])
     frame = np.eye(4)
     frame[:3, :3] = axes
-    frame[:3, 3] = spec.mesh.center_mass
+    frame[:3, 3] = CENTIMETRES * spec.mesh.center_mass
     body.mass = spec.mass
     body.cmass_local_pose = sapien.Pose(frame)
-    body.inertia = moments.astype(np.float32)
-    body.max_depenetration_velocity = 1.0
+    body.inertia = (CENTIMETRES**2 * moments).astype(np.float32)
+    body.max_depenetration_velocity = CENTIMETRES * BODIES.depenetration
     body.linear_damping = body.angular_damping = 0.0
     return body
 
@@ -195,23 +196,34 @@ def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
     """
     loader = scene.create_urdf_loader()
     loader.fix_root_link = True
+    loader.scale = CENTIMETRES
     loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
     with temporary_folder() as folder:
         hand = loader.load(str(write_file(folder / "hand.urdf", mounted_urdf(spec))))
+    for link in hand.links:
+        # the loader scales masses as volumes, and moments of inertia as those of equal density
+        link.mass = link.mass / CENTIMETRES**3
+        link.inertia = link.inertia / CENTIMETRES**3
+        link.max_linear_velocity = CENTIMETRES * link.max_linear_velocity
     _set_missing_masses(hand, spec.urdf)
     slides = {slide.name: slide for slide in spec.slides}
     spec.check_drives([j.name for j in hand.active_joints if j.name not in slides])
     start = []
     for joint in hand.active_joints:
         joint.set_friction(0.0)
+        # of a position or force, and of a stiffness, damping or rotor
+        unit = CENTIMETRES if joint.type == "prismatic" else 1.0
+        square = 1.0 if joint.type == "prismatic" else CENTIMETRES**2
         if joint.name in slides:
             drive = MOUNT_DRIVE
             position = slides[joint.name].start
         else:
             drive = spec.drives[joint.name]
             position = float(spec.joints[joint.name])
-            joint.set_armature(np.array([ARMATURE], np.float32))
-        joint.set_drive_properties(drive.kp, drive.kd, force_limit=drive.effort)
+            joint.set_armature(np.array([square * ARMATURE], np.float32))
+        limit = unit * square * drive.effort
+        joint.set_drive_properties(square * drive.kp, square * drive.kd, force_limit=limit)
+        position = unit * position
         joint.set_drive_target(position)
         start.append(position)
     hand.set_qpos(np.array(start, np.float32))
@@ -223,7 +235,7 @@ def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
             kind, hits = masks.get(link.name, (0, 0))
             shape.set_collision_groups([kind, everything_else | hits, 0, 0])
             if link.name in spec.tip_links:
-                shape.min_patch_radius = spec.patch
+                shape.min_patch_radius = CENTIMETRES * spec.patch
     return hand
 
 
@@ -246,7 +258,7 @@ def _set_missing_masses(hand: Any, urdf: Urdf) -> None:
     for link in hand.links:
         if link.name in light:
             link.mass = BODIES.least_mass
-            link.inertia = np.full(3, BODIES.least_inertia, np.float32)
+            link.inertia = np.full(3, CENTIMETRES**2 * BODIES.least_inertia, np.float32)
     bodies = [head for head, mass in masses.items() if mass == 0]
     if bodies:
         found = f"links without mass ({', '.join(bodies)}), which are simulated as of water"

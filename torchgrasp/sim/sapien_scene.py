@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from torchgrasp.sim.sapien_bodies import (
+    CENTIMETRES,
     import_sapien,
     mounted_hand,
     open_world,
@@ -71,6 +72,7 @@ class SapienScene(SimulatedScene):
         self._frames = np.array([_matrix(j.pose_in_child) for j in self._driven])
         self._children = [j.child_link for j in self._driven]
         self._slides = np.array([j.type == "prismatic" for j in self._driven])
+        self._units = np.where(self._slides, CENTIMETRES, 1.0)
         self._moves = np.zeros((len(self.tips), len(self._driven)))
         for t, link in enumerate(self.tips):
             while link is not None:
@@ -123,11 +125,18 @@ class SapienScene(SimulatedScene):
         first body.
         """
         for point in contact.points:
-            impulse = point.impulse
+            impulse = point.impulse / CENTIMETRES
             squared = impulse.dot(impulse)
             if squared:
                 size = float(np.sqrt(squared))
-                yield size, [*(-sign * impulse).tolist(), *(size * point.position).tolist(), size]
+                yield (
+                    size,
+                    [
+                        *(-sign * impulse).tolist(),
+                        *(size / CENTIMETRES * point.position).tolist(),
+                        size,
+                    ],
+                )
 
     def step(self) -> StepContacts:
         """Advance by one timestep; return the impulses [N s], forces [N] and places of the hand's
@@ -140,6 +149,7 @@ class SapienScene(SimulatedScene):
         touching = [i for i, weight in enumerate(contacts.weight.tolist()) if weight > 0.0]
         if touching:
             wrenches = self.hand.get_link_incoming_joint_forces()[self._tip_index, :3].astype(float)
+            wrenches = wrenches / CENTIMETRES
             for i in touching:
                 world_from_sensor = self._pose(self.tips[i])[:3, :3].dot(self._sensor_axes[i])
                 contacts.force[i] = world_from_sensor.dot(wrenches[i])
@@ -151,7 +161,7 @@ class SapienScene(SimulatedScene):
 
         They are in the order of `joint_names`, and hold until the next call.
         """
-        for joint, target in zip(self._driven, targets.tolist(), strict=True):
+        for joint, target in zip(self._driven, (self._units * targets).tolist(), strict=True):
             joint.set_drive_target(target)
 
     @_noted
@@ -160,8 +170,8 @@ class SapienScene(SimulatedScene):
 
         Both are in the world's frame, and act in all later steps until the next call.
         """
-        self._force = np.asarray(force, np.float32)
-        self._torque = np.asarray(torque, np.float32)
+        self._force = np.asarray(CENTIMETRES * force, np.float32)
+        self._torque = np.asarray(CENTIMETRES**2 * torque, np.float32)
         self._pulled = bool(self._force.any() or self._torque.any())
 
     @_noted
@@ -169,13 +179,13 @@ class SapienScene(SimulatedScene):
         """Move the object at once by a displacement `shift` (3,) [m] in the world's frame."""
         sapien, _ = import_sapien()
         pose = self.body.entity_pose
-        self.body.entity.set_pose(sapien.Pose(pose.p + shift, pose.q))
+        self.body.entity.set_pose(sapien.Pose(pose.p + CENTIMETRES * shift, pose.q))
 
     def joints(self) -> np.ndarray:
         """Return the positions (j,) [rad or m] of the j driven joints, in the order of
         `joint_names`.
         """
-        return np.asarray(self.hand.get_qpos(), float)[self._places]
+        return np.asarray(self.hand.get_qpos(), float)[self._places] / self._units
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
         """Return the Jacobian (f, 3, j) [m/rad] of a point on each fingertip with respect to the j
@@ -184,8 +194,7 @@ class SapienScene(SimulatedScene):
         Jacobian and `points` (f, 3) [m] are in the world's frame. Columns of joints that slide have
         no unit.
         """
-        poses = [link.entity_pose.to_transformation_matrix() for link in self._children]
-        frames = np.array(poses, float) @ self._frames
+        frames = np.array([self._pose(link) for link in self._children]) @ self._frames
         axes = frames[:, :3, 0]
         arms = points[:, None, :] - frames[:, :3, 3]
         # coordinates of a cross product; np.cross takes much longer
@@ -214,10 +223,8 @@ class SapienScene(SimulatedScene):
         touching = [
             c for c in self.system.get_contacts() if not set(c.bodies) <= self._place_of.keys()
         ]
-        return max(
-            (float(-point.separation) for contact in touching for point in contact.points),
-            default=0.0,
-        )
+        depths = (-point.separation for contact in touching for point in contact.points)
+        return float(max(depths, default=0.0)) / CENTIMETRES
 
     def _pose(self, body: Any) -> np.ndarray:
         """Return the pose (4, 4) of a body in the world's frame."""
@@ -226,10 +233,12 @@ class SapienScene(SimulatedScene):
     @_noted
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
         """Set target [m] and target speed [m/s] of a joint of the mount."""
-        self._mount[joint].set_drive_target(float(target))
-        self._mount[joint].set_drive_velocity_target(float(speed))
+        self._mount[joint].set_drive_target(float(CENTIMETRES * target))
+        self._mount[joint].set_drive_velocity_target(float(CENTIMETRES * speed))
 
 
 def _matrix(pose: Any) -> np.ndarray:
-    """Return a SAPIEN pose as a matrix (4, 4)."""
-    return pose.to_transformation_matrix().astype(float)
+    """Return a SAPIEN pose as a matrix (4, 4) [m]."""
+    matrix = pose.to_transformation_matrix().astype(float)
+    matrix[:3, 3] /= CENTIMETRES
+    return matrix
