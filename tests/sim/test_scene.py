@@ -14,11 +14,18 @@ from torchgrasp import load_hand
 from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.sim.mujoco_scene import OBJECT
-from torchgrasp.sim.sapien_bodies import CENTIMETRES
+from torchgrasp.sim.sapien_bodies import (
+    CENTIMETRES,
+    open_world,
+    place,
+    rigid_body,
+    surface_of,
+)
 from torchgrasp.sim.scene_spec import (
     APPROACH_JOINT,
     LIFT_JOINT,
     SHIFT_JOINTS,
+    Body,
     SceneSpec,
     euler_from_rotation,
     mounted_urdf,
@@ -331,3 +338,44 @@ def test_only_vertices_behind_the_edge_are_moved_up_to_the_table():
         assert found[:, 2].min() == 0.2
         assert np.abs(found - part.vertices).max() < 3e-4
     assert SceneSpec(*args, height=0.2).hulls[0][1][:, 2].min() == 0.2
+
+
+def depth_in_disc(centre, radius, rim, height):
+    """The depth [m] of a ball in a disc with a convex `rim` (n, 2) [m]; its centre is beside it."""
+    edges = np.roll(rim, -1, 0) - rim
+    share = np.clip(((centre[:2] - rim) * edges).sum(1) / (edges**2).sum(1), 0, 1)
+    beside = np.linalg.norm(rim + share[:, None] * edges - centre[:2], axis=1).min()
+    return radius - math.hypot(beside, max(centre[2] - height, 0.0))
+
+
+def test_a_fingertip_over_the_rim_of_a_disc_meets_it():
+    """In metres PhysX finds no contact in six of these directions
+    (findings/sapien-ball-sinks-into-a-disc-without-a-contact.sh)."""
+    sapien = pytest.importorskip("sapien")
+    radius = 0.012
+    height = 0.012
+    turns = 2 * np.pi * np.arange(10) / 10
+    rim = 0.03 * np.stack([np.cos(turns), np.sin(turns)], 1)
+    corners = np.concatenate([np.c_[rim, 0 * turns], np.c_[rim, 0 * turns + height]])
+    disc = trimesh.convex.convex_hull(corners)
+    system, scene = open_world(0.0, 1 / 500, False)
+    place(scene, "disc", rigid_body(surface_of(0.8), Body(disc, [disc], 0.1), [corners], 0.0))
+    ball = sapien.physx.PhysxRigidDynamicComponent()
+    ball.attach(sapien.physx.PhysxCollisionShapeSphere(CENTIMETRES * radius, surface_of(0.8)))
+    place(scene, "ball", ball)
+    still = sapien.Pose()
+    tried = 0
+    for turn in 0.31 * np.arange(12):
+        for away in np.arange(0.045, 0.037, -6e-5):
+            centre = np.array([away * math.cos(turn), away * math.sin(turn), 0.016])
+            for entity, pose in zip(
+                scene.entities, (still, sapien.Pose(CENTIMETRES * centre)), strict=True
+            ):
+                entity.set_pose(pose)
+                body = entity.find_component_by_type(sapien.physx.PhysxRigidDynamicComponent)
+                body.linear_velocity = body.angular_velocity = np.zeros(3)
+            system.step()
+            if 1e-4 < depth_in_disc(centre, radius, rim, height) < 1e-3:
+                tried += 1
+                assert any(contact.points for contact in system.get_contacts())
+    assert tried > 100
