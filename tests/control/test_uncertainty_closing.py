@@ -279,6 +279,31 @@ def test_a_raised_palm_goes_down_as_coupled_fingers_close_upwards():
     assert torch.equal(law.palm, rise)
 
 
+def test_fingers_go_down_by_themselves_where_one_tip_keeps_the_raised_palm_up():
+    slope = torch.full((3,), 0.5).double()
+    normals = torch.stack([(1 - slope**2).sqrt() * NORMALS[:, 0], 0 * slope, slope], -1)
+    rim = TARGET * real([1.0, 1.0, 0.0]) + real([0.0, 0.0, 0.005])
+    gains = dataclasses.replace(
+        GAINS, target=rim, covariance=surface_covariance(normals, real([0.004] * 3))
+    )
+    low = dataclasses.replace(
+        reference(), normals=normals, gains=gains, table=Plane(real([0, 0, 1]), 0.0)
+    )
+    raised = dataclasses.replace(low)
+    vars(raised)["rise"] = real([0, 0, 0.006])
+    law = UncertaintyClosing(raised, RIGID_ARM)
+    # tips at the table where the palm is down, the first of them where it is raised
+    start = rim + 0.01 * normals + 0.01 * NORMALS
+    start[:, 2] = real([0.004, 0.01, 0.01])
+    joints = torch.zeros(9).double()
+    for _ in range(100):
+        tips = start + joints.reshape(3, 3)
+        joints = law(dataclasses.replace(observation(joints=joints), tips=tips), PERIOD)
+    height = (start + joints.reshape(3, 3) + law.palm)[:, 2] - 0.01
+    assert float(law.palm[2]) > 0.004  # the first tip holds it
+    assert float(height.max()) < 0.002
+
+
 def test_joints_that_would_be_too_fast_slow_down_together():
     velocity = real([[2.0, 1.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
     free, slow = (

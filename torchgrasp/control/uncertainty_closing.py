@@ -94,7 +94,8 @@ class UncertaintyClosing:
     * Fingertips with contacts on the rim of a low object go down to the table. They slide along it
       to the object.
     * A palm that starts above its planned pose (`ClosingReference.rise`) goes down while the
-      fingers close. It goes down as far as the closing raises the fingertips on their arcs.
+      fingers close. It goes down as far as the closing raises the fingertips on their arcs. Where
+      one fingertip keeps it up, the other fingers go down by themselves.
     * Three `ClosingOptions` act while the fingers close. With `wait`, fingers that touch wait for
       the others. With `pose_estimate`, touches locate the object; up to `palm_reach`, the palm
       follows.
@@ -258,8 +259,8 @@ class UncertaintyClosing:
         """Return the velocities [m/s] of the fingertips in the hand, then that of a palm that
         started raised.
 
-        While the palm is raised, the fingers move their tips along the table only. The palm moves
-        along the table's normal, so that no tip is lower than it should be.
+        While the palm is raised, it moves along the table's normal, so that no tip is lower than it
+        should be. Where one tip keeps it up, the others go down by their own joints.
         """
         if not self.raised or self.reference.table is None:
             return velocity, STILL
@@ -270,8 +271,10 @@ class UncertaintyClosing:
         along = velocity - (velocity @ up)[:, None] * up
         made = jacobian @ joint_step(flat, along, period) / period
         # the tip that lacks most height decides how the palm moves
-        descent = ((velocity - made) @ up).amax() * up
-        return made, limit_norm(descent, PALM_SPEED)
+        descent = limit_norm(((velocity - made) @ up).amax() * up, PALM_SPEED)
+        # the other tips move down by their own joints what the palm leaves to them
+        left = ((velocity - made - descent) @ up).clamp_max(0.0)
+        return made + left[:, None] * up, descent
 
     def _without_sensor(
         self,
