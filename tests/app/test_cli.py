@@ -312,7 +312,11 @@ def test_a_misspelt_name_is_answered_with_the_nearest_one(
     assert refusal(*words).endswith(f"; did you mean {near}?\n")
 
 
-def test_an_empty_result_names_what_would_help(tmp_path, run_command, monkeypatch):
+def test_an_empty_result_names_what_would_help_and_leaves_no_page_of_an_earlier_plan(
+    tmp_path, run_command, monkeypatch
+):
+    for name in ("surface.ply", "report.html", "view.html", "run.rrd"):
+        (tmp_path / name).write_text("of another plan")
     monkeypatch.setattr("torchgrasp.planner.explain.EXPLAIN", ExplainNumbers(trials=1))
     options = ["--starts", "5", "--friction", "0", "--table", "0", "--no-report"]
     code, out, _ = run_command("grasp", VIEW, "--hand", "barrett", "--out", tmp_path, *options)

@@ -30,7 +30,7 @@ from torchgrasp.app.cli.results import (
     table_under,
     write_run,
 )
-from torchgrasp.app.report.run_data import Run, grasp_columns, grasp_rows, verdict
+from torchgrasp.app.report.run_data import RECORDING, Run, grasp_columns, grasp_rows, verdict
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.pose import find_plausible
 from torchgrasp.data.shipped import find_view
@@ -547,7 +547,7 @@ class Grasp(ForPrograms):
         if self.rerun:
             from torchgrasp.app.report.recording import write_recording
 
-            paths.append(write_recording(out / "run.rrd", run))
+            paths.append(write_recording(out / RECORDING, run))
         return ", ".join(map(str, paths))
 
     def _find_easiest(
