@@ -1,6 +1,7 @@
 """The command line: what a bad input ends with, and that nothing is left behind."""
 
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -350,6 +351,34 @@ def test_help_says_no_default_that_says_nothing_and_breaks_lines_by_their_width(
     rows = [line.strip("│ ") for line in said.splitlines() if line.startswith("│ " + 10 * " ")]
     short = [row for row in rows if len(row) < 40]
     assert all(row.endswith((".", ")", "]")) for row in short), short
+
+
+def test_no_command_overwrites_a_file_that_it_reads(tmp_path, monkeypatch, refusal):
+    monkeypatch.chdir(tmp_path)
+    files = {
+        "mesh.ply": Path(MESH),
+        "view.ply": Path(VIEW),
+        "plan/grasps.safetensors": DATA / "jug" / "barrett.safetensors",
+    }
+    (tmp_path / "plan").mkdir()
+    for name, source in files.items():
+        shutil.copy(source, name)
+    (tmp_path / "link.ply").symlink_to("mesh.ply")
+    (tmp_path / "plan" / "surface.ply").symlink_to("../mesh.ply")
+    np.save("depth.npy", np.ones((4, 4)))
+    (tmp_path / "depth.npy").rename("depth.npz")
+    for words in (
+        ["cloud", "render", "mesh.ply", "--out", "./mesh.ply"],
+        ["cloud", "render", "mesh.ply", "--out", "link.ply"],
+        ["cloud", "thin", "view.ply", "--out", tmp_path / "view.ply"],
+        ["shape", "surface", "view.ply", "--out", "view.ply"],
+        ["cloud", "scene", "depth.npz", "--frames", "depth.npz", "--out", "depth.npz"],
+        ["export", "plan", "--out", "plan/grasps.safetensors"],
+        ["export", "plan/grasps.safetensors", "--out", "plan/surface.ply"],
+        ["import", "view.ply", "--hand", "barrett", "--out", "view.ply"],
+    ):
+        assert refusal(*words).startswith("--out: "), words
+    assert all(Path(name).read_bytes() == source.read_bytes() for name, source in files.items())
 
 
 def test_too_few_numbers_of_an_option_are_refused_without_markup(capsys):

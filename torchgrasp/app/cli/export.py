@@ -9,8 +9,16 @@ from typing import Any, Literal
 import numpy as np
 
 from torchgrasp import export as formats
-from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
-from torchgrasp.app.cli.results import PLANNED_HELP, load_planned
+from torchgrasp.app.cli.command import (
+    Command,
+    arguments,
+    check_kept,
+    naming,
+    option,
+    positional,
+    required,
+)
+from torchgrasp.app.cli.results import GRASPS, PLANNED_HELP, load_planned
 from torchgrasp.app.report.glb import write_glb
 from torchgrasp.cloud.agreement import check_contacts
 from torchgrasp.export.foreign import read_poses
@@ -121,6 +129,7 @@ class Export(Command):
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return 0, or 1 for no grasp."""
         planned, surface = load_planned(self.grasps)
+        check_kept(self.out, surface.with_name(GRASPS), surface)
         replaced = (self._plays or self.format == "glb") and surface.is_file()
         if self._needs_object and self.object is None and not replaced:
             raise BadArgument("--object", None, f"a path with --format {self.format}")
