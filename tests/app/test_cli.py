@@ -58,6 +58,7 @@ def bad_inputs(folder):
         "empty text": ([folder / "empty.xyz", *hand], ["CLOUD"]),
         "empty ply": ([folder / "empty.ply", *hand], ["CLOUD"]),
         "other suffix": ([folder / "cloud.docx", *hand], ["CLOUD", ".ply"]),
+        "friction of no edge": ([VIEW, "--table-friction", "0.5"], ["--table-friction", "--edge"]),
         "two points": ([folder / "two.npy", *hand], ["CLOUD", "2 points", "at least 4"]),
         "millimetres": ([folder / "mm.npy", *hand], ["CLOUD", "m"]),
         "nan": ([folder / "nan.npy", *hand], ["CLOUD", "NaN", "198 of 200", "at least 4"]),

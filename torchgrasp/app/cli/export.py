@@ -25,7 +25,7 @@ from torchgrasp.export.foreign import read_poses
 from torchgrasp.export.postures import follower_joints, stands_still
 from torchgrasp.files import read_bytes, read_json, write_file
 from torchgrasp.foundation.errors import BadArgument, ModelFileError
-from torchgrasp.foundation.rules import Count
+from torchgrasp.foundation.rules import Count, check_suffix
 from torchgrasp.geometry.mesh import SUFFIXES, load_triangles, read_mesh
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
@@ -139,6 +139,8 @@ class Export(Command):
         taken = trial if self._plays else texts
         if unused := [name for name in (*robot, *trial) if name not in taken]:
             raise BadArgument(unused[0], f"--format {self.format}", "a format that it is for")
+        if self.format == "glb":
+            check_suffix("--out", self.out, ".glb")
         hand = hand_of(planned, self.hand)
         if planned.meta.get("hand_sha256") != hand.source.sha256:
             other = f"{hand.name}, whose files are not those that were planned with"

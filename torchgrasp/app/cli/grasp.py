@@ -246,6 +246,8 @@ class Grasp(ForPrograms):
         beside = [name for name, given in others.items() if given]
         if self.edge is not None and beside:
             raise BadArgument("--edge", f"{beside[0]} beside it", "one of the two")
+        if self.edge is None and self.table_friction != Grasp.table_friction:
+            raise BadArgument("--table-friction", "no --edge beside it", "both, or neither")
 
     def _grasp_cloud(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
         """Plan on a point cloud and write the results; return the exit code."""
