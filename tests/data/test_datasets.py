@@ -144,6 +144,25 @@ def test_meshes_of_other_formats_and_in_folders_are_told_and_own_folders_are_not
             assert write_objects(meshes, out, views=1) == ["carton"]  # and warns of nothing
 
 
+def test_other_objects_and_entries_of_a_manifest_are_not_lost(tmp_path):
+    box = trimesh.creation.box((0.05, 0.06, 0.12))
+    for name in ("carton", "tin"):
+        (tmp_path / name).mkdir()
+        box.export(tmp_path / name / f"{name}.stl")
+    objects = tmp_path / "objects"
+    write_objects(tmp_path / "carton", objects, views=1)
+    manifest = objects / "manifest.json"
+    before = manifest.read_text()
+    with pytest.raises(DatasetError, match=r"out: .*would be lost, carton$"):
+        write_objects(tmp_path / "tin", objects, views=1)
+    assert manifest.read_text() == before and not (objects / "tin").exists()
+    edited = before.replace('"views"', '"mass_kg": 0.3, "views"')
+    manifest.write_text(edited)
+    with pytest.raises(DatasetError, match=r"out: .*would be lost, carton$"):
+        write_objects(tmp_path / "carton", objects, views=1)
+    assert manifest.read_text() == edited
+
+
 def test_a_mass_and_a_scale_of_other_names_are_told_once(tmp_path):
     entries = {name: {"views": {}, "mass": 0.3, "scale": 0.5} for name in ("mug", "tin")}
     entries["jug"] = {"views": {}, "mass": 0.3, "mass_kg": 0.4, "suggested_scale": 2.0}

@@ -185,6 +185,7 @@ def write_objects(
 
     Raises:
         DatasetError: there are no meshes, or two meshes of one name.
+        DatasetError: `out` has a manifest with other objects, or with entries besides "views".
         MeshError: a mesh is malformed, open or without volume.
         OutputError: the folder cannot be written.
 
@@ -205,6 +206,7 @@ def write_objects(
             found = f"{meshes}, {missing}"
         allowed = f"a folder of files {', '.join(SUFFIXES)}, each of its own name"
         raise DatasetError("meshes", found, allowed)
+    _check_replaced(Path(out), names)
     written = {Path(out).resolve(), *((Path(out) / name).resolve() for name in names)}
     if left := [path.name for path in sorted(Path(meshes).iterdir()) if _is_left(path, written)]:
         shown = ", ".join(left[:SHOWN_NAMES])
@@ -221,6 +223,23 @@ def write_objects(
         entries[path.stem] = {"views": poses}
     write_file(Path(out) / "manifest.json", format_json({"objects": entries}))
     return names
+
+
+def _check_replaced(out: Path, names: Sequence[str]) -> None:
+    """Raise `DatasetError` if the folder `out` has a manifest from which more than views would be
+    lost: other objects than `names`, or what a user has added.
+    """
+    if not (out / "manifest.json").is_file():
+        return
+    lost = [
+        name
+        for name, entry in _read_fields(out, ()).items()
+        if name not in names or entry.entries().keys() != {"views"}
+    ]
+    if lost:
+        shown = ", ".join(lost[:SHOWN_NAMES])
+        found = f"{out} with a manifest whose objects or entries would be lost, {shown}"
+        raise DatasetError("out", found, "a new folder, or one that the same meshes made")
 
 
 def _is_left(path: Path, written: set[Path]) -> bool:
