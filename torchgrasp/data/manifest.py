@@ -38,7 +38,7 @@ MOST_MASS = 1e4
 """Largest scale, its inverse being the least, largest coordinate [m] of a camera, and least and
 largest mass [kg].
 """
-LIKE = {"mass": "mass_kg", "scale": "suggested_scale"}
+MISNAMED = {"mass": "mass_kg", "scale": "suggested_scale"}
 """Names that others give to entries of an object, which are not read, and our names."""
 UNREAD = (".glb", ".gltf", ".dae", ".3mf", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".step")
 """Endings of meshes that `write_objects` does not read."""
@@ -129,7 +129,7 @@ def read_entries(
             found[name] = _parse_entry(name, field)
         except DatasetError as error:
             found[name] = error
-    for theirs, ours in LIKE.items():
+    for theirs, ours in MISNAMED.items():
         values = [fields[name].value for name in found if not isinstance(found[name], DatasetError)]
         if count := sum(theirs in value and ours not in value for value in values):
             told = f"{theirs!r} of {count} objects is not read: call it {ours!r}"
