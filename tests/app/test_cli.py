@@ -1,6 +1,7 @@
 """The command line: what a bad input ends with, and that nothing is left behind."""
 
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -57,6 +58,7 @@ def bad_inputs(folder):
         "empty text": ([folder / "empty.xyz", *hand], ["CLOUD"]),
         "empty ply": ([folder / "empty.ply", *hand], ["CLOUD"]),
         "other suffix": ([folder / "cloud.docx", *hand], ["CLOUD", ".ply"]),
+        "friction of no edge": ([VIEW, "--table-friction", "0.5"], ["--table-friction", "--edge"]),
         "two points": ([folder / "two.npy", *hand], ["CLOUD", "2 points", "at least 4"]),
         "millimetres": ([folder / "mm.npy", *hand], ["CLOUD", "m"]),
         "nan": ([folder / "nan.npy", *hand], ["CLOUD", "NaN", "198 of 200", "at least 4"]),
@@ -312,7 +314,11 @@ def test_a_misspelt_name_is_answered_with_the_nearest_one(
     assert refusal(*words).endswith(f"; did you mean {near}?\n")
 
 
-def test_an_empty_result_names_what_would_help(tmp_path, run_command, monkeypatch):
+def test_an_empty_result_names_what_would_help_and_leaves_no_page_of_an_earlier_plan(
+    tmp_path, run_command, monkeypatch
+):
+    for name in ("surface.ply", "report.html", "view.html", "run.rrd"):
+        (tmp_path / name).write_text("of another plan")
     monkeypatch.setattr("torchgrasp.planner.explain.EXPLAIN", ExplainNumbers(trials=1))
     options = ["--starts", "5", "--friction", "0", "--table", "0", "--no-report"]
     code, out, _ = run_command("grasp", VIEW, "--hand", "barrett", "--out", tmp_path, *options)
@@ -346,6 +352,34 @@ def test_help_says_no_default_that_says_nothing_and_breaks_lines_by_their_width(
     rows = [line.strip("│ ") for line in said.splitlines() if line.startswith("│ " + 10 * " ")]
     short = [row for row in rows if len(row) < 40]
     assert all(row.endswith((".", ")", "]")) for row in short), short
+
+
+def test_no_command_overwrites_a_file_that_it_reads(tmp_path, monkeypatch, refusal):
+    monkeypatch.chdir(tmp_path)
+    files = {
+        "mesh.ply": Path(MESH),
+        "view.ply": Path(VIEW),
+        "plan/grasps.safetensors": DATA / "jug" / "barrett.safetensors",
+    }
+    (tmp_path / "plan").mkdir()
+    for name, source in files.items():
+        shutil.copy(source, name)
+    (tmp_path / "link.ply").symlink_to("mesh.ply")
+    (tmp_path / "plan" / "surface.ply").symlink_to("../mesh.ply")
+    np.save("depth.npy", np.ones((4, 4)))
+    (tmp_path / "depth.npy").rename("depth.npz")
+    for words in (
+        ["cloud", "render", "mesh.ply", "--out", "./mesh.ply"],
+        ["cloud", "render", "mesh.ply", "--out", "link.ply"],
+        ["cloud", "thin", "view.ply", "--out", tmp_path / "view.ply"],
+        ["shape", "surface", "view.ply", "--out", "view.ply"],
+        ["cloud", "scene", "depth.npz", "--frames", "depth.npz", "--out", "depth.npz"],
+        ["export", "plan", "--out", "plan/grasps.safetensors"],
+        ["export", "plan/grasps.safetensors", "--out", "plan/surface.ply"],
+        ["import", "view.ply", "--hand", "barrett", "--out", "view.ply"],
+    ):
+        assert refusal(*words).startswith("--out: "), words
+    assert all(Path(name).read_bytes() == source.read_bytes() for name, source in files.items())
 
 
 def test_too_few_numbers_of_an_option_are_refused_without_markup(capsys):

@@ -174,6 +174,9 @@ def test_a_motion_has_all_joints_and_goes_through_the_grasp(arm, hand, good):
     assert torch.allclose(real(seconds), motion.times)
     with pytest.raises(BadArgument, match=r"grasps: .*posture of this arm"):
         plan_motion(arm, hand, dataclasses.replace(good[:1], arm=None))
+    failed = dataclasses.replace(good[:1], status=torch.tensor([int(Status.NO_PROMISE)]))
+    with pytest.raises(BadArgument, match=r"grasps: .*failed .*NO_PROMISE"):
+        plan_motion(arm, hand, failed)
     for other in (
         ur5e(hand, (-0.45, 0.0, 0.0)),
         arm.moved(random_motion(2)),

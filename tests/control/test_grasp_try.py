@@ -60,6 +60,14 @@ def test_a_lift_fails_where_the_object_is_lost_or_too_heavy():
     assert attempt.fails(held, 0.03, PERIOD)  # for good
 
 
+def test_a_controller_of_another_grasp_is_refused():
+    grasps = around(0.0, 90.0)
+    fixed = start(grasps[0])
+    attempt = GraspTry(grasps, lambda grasp: fixed)
+    with pytest.raises(BadArgument, match=r"start: .*another pose"):
+        attempt.next()
+
+
 def test_the_hand_opens_before_it_withdraws_and_then_waits():
     attempt = GraspTry(around(0.0), start)
     closed = observation(joints=torch.full((9,), PRESSED).double())

@@ -11,7 +11,7 @@ from torchgrasp import load_hand
 from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.hand.load import find_hand
 from torchgrasp.values.planning import Grasps
 
@@ -49,6 +49,12 @@ def test_another_stiffness_and_a_change_below_the_bound_are_no_other_geometry(tm
         assert hand.source.sha256 != grasp.meta["hand_sha256"]
         reference = ClosingReference.from_grasp(hand, grasp)
         assert torch.equal(reference.joints, grasp.joints[0].double())
+
+
+def test_a_grasp_that_failed_a_check_has_no_closing_plan(grasp):
+    failed = dataclasses.replace(grasp, status=torch.tensor([int(Status.TABLE_COLLISION)]))
+    with pytest.raises(BadArgument, match=r"grasps: .*grasps\.best, got .*1 TABLE_COLLISION"):
+        ClosingReference.from_grasp(load_hand("allegro"), failed)
 
 
 @pytest.mark.parametrize("use", [squeeze, ClosingReference.from_grasp])

@@ -1,6 +1,7 @@
 """Folders of objects: what the manifest says is what is read."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,22 @@ import trimesh
 
 from torchgrasp import PointCloud
 from torchgrasp.cloud.read import save_cloud
-from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view, write_objects
-from torchgrasp.foundation.errors import BadArgument, CloudWarning, MeshError, TwoBodies
+from torchgrasp.data import (
+    list_views,
+    read_entries,
+    read_entry,
+    read_object_mesh,
+    read_view,
+    write_objects,
+)
+from torchgrasp.foundation.errors import (
+    BadArgument,
+    CloudWarning,
+    DatasetError,
+    MeshError,
+    NoEffect,
+    TwoBodies,
+)
 
 
 @pytest.fixture
@@ -110,6 +125,67 @@ def test_a_folder_of_meshes_becomes_objects_with_views_that_see_them(tmp_path: P
     write_objects(tmp_path / "meshes", again, views=2)
     for file in sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file()):
         assert (again / file).read_bytes() == (tmp_path / "out" / file).read_bytes()
+
+
+def test_meshes_of_other_formats_and_in_folders_are_told_and_own_folders_are_not(tmp_path):
+    box = trimesh.creation.box((0.05, 0.06, 0.12))
+    meshes = tmp_path / "meshes"
+    (meshes / "more").mkdir(parents=True)
+    for name in ("carton.stl", "tin.GLB", "more/mug.obj"):
+        box.export(meshes / name, file_type=name[-3:].lower())
+    (meshes / "carton.mtl").write_text("a material is no mesh")
+    with pytest.warns(NoEffect, match=r"2 .*not read, more, tin\.GLB: ") as told:
+        assert write_objects(meshes, tmp_path / "objects", views=1) == ["carton"]
+    assert len(told) == 1
+    (meshes / "tin.GLB").unlink()
+    shutil.rmtree(meshes / "more")
+    for out in (meshes / "objects", meshes):
+        for _ in range(2):
+            assert write_objects(meshes, out, views=1) == ["carton"]  # and warns of nothing
+
+
+def test_other_objects_and_entries_of_a_manifest_are_not_lost(tmp_path):
+    box = trimesh.creation.box((0.05, 0.06, 0.12))
+    for name in ("carton", "tin"):
+        (tmp_path / name).mkdir()
+        box.export(tmp_path / name / f"{name}.stl")
+    objects = tmp_path / "objects"
+    write_objects(tmp_path / "carton", objects, views=1)
+    manifest = objects / "manifest.json"
+    before = manifest.read_text()
+    with pytest.raises(DatasetError, match=r"out: .*would be lost, carton$"):
+        write_objects(tmp_path / "tin", objects, views=1)
+    assert manifest.read_text() == before and not (objects / "tin").exists()
+    edited = before.replace('"views"', '"mass_kg": 0.3, "views"')
+    manifest.write_text(edited)
+    with pytest.raises(DatasetError, match=r"out: .*would be lost, carton$"):
+        write_objects(tmp_path / "carton", objects, views=1)
+    assert manifest.read_text() == edited
+
+
+def test_a_mass_and_a_scale_of_other_names_are_told_once(tmp_path):
+    entries = {name: {"views": {}, "mass": 0.3, "scale": 0.5} for name in ("mug", "tin")}
+    entries["jug"] = {"views": {}, "mass": 0.3, "mass_kg": 0.4, "suggested_scale": 2.0}
+    (tmp_path / "manifest.json").write_text(json.dumps({"objects": entries}))
+    with pytest.warns(NoEffect) as told:
+        found = read_entries(tmp_path)
+    assert [str(one.message).partition(": ")[2] for one in told] == [
+        "'mass' of 2 objects is not read: call it 'mass_kg'",
+        "'scale' of 2 objects is not read: call it 'suggested_scale'",
+    ]
+    assert (found["mug"].mass, found["mug"].scale, found["jug"].mass) == (None, 1.0, 0.4)
+    assert read_entries(tmp_path, ["jug"])["jug"].scale == 2.0
+
+
+def test_a_name_that_occurs_twice_in_a_manifest_is_refused(tmp_path):
+    twice = {
+        "mug": '{"objects": {"mug": {"views": {}}, "tin": {}, "mug": {"views": {}}}}',
+        "suggested_scale": '{"objects": {"mug": {"suggested_scale": 1, "suggested_scale": 2}}}',
+    }
+    for name, text in twice.items():
+        (tmp_path / "manifest.json").write_text(text)
+        with pytest.raises(DatasetError, match=f"'{name}' twice in one object"):
+            read_entries(tmp_path)
 
 
 def test_a_normalised_mesh_and_bodies_that_lie_apart_are_told(tmp_path):

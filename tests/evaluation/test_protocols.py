@@ -168,6 +168,8 @@ def test_the_command_line_changes_only_what_was_asked_for_and_displaces_no_objec
     assert (moved.noise, moved.displaced, moved.push) == (PoseNoise(0.03, 0.0, 5), "approach", 2.5)
     with pytest.raises(BadArgument, match="--displaced"):
         disturbed("dexgraspbench", displaced=0.03)
+    with pytest.raises(BadArgument, match="--during"):
+        disturbed("table-lift", during=True)
     with pytest.raises(BadArgument, match=r"^--displaced: expected a number in \[0, 0\.5\], got 3"):
         disturbed("table-lift", displaced=3.0)
 

@@ -150,6 +150,12 @@ def test_any_number_of_workers_gives_the_same_bits_and_a_bad_object_is_refused(f
     )
     other = next(evaluate(folder, load_hand("allegro"), quick, planned, folder=tmp_path))
     assert other.refusal is Status.BAD_OBJECT and "another cloud or hand" in other.note
+    path = tmp_path / "tin" / "view0.safetensors"
+    found = load_grasps(path)
+    codes = found.status.index_fill(0, torch.tensor(0), int(Status.OBJECT_COLLISION))
+    dataclasses.replace(found, status=codes).save(path)
+    mixed = next(evaluate(folder, hand, quick, planned, folder=tmp_path))
+    assert (mixed.executable, mixed.attempts) == (0, ()) and "OBJECT_COLLISION" in mixed.note
 
 
 def test_a_view_without_grasps_is_refused_for_what_failed_most_often(folder):

@@ -11,9 +11,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.pinch import pinch
-from torchgrasp import Plane
+from torchgrasp import Plane, load_hand
 from torchgrasp.app import cli
+from torchgrasp.control import squeeze
 from torchgrasp.control.protocol import POSE_TIME
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import (
     ArmMotion,
     format_grasps,
@@ -22,7 +24,7 @@ from torchgrasp.export import (
     format_trajectories,
     read_foreign,
 )
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoEffect, Status
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector
 
 yaml = pytest.importorskip("yaml")
@@ -255,6 +257,19 @@ def test_a_time_just_below_a_second_has_valid_nanoseconds():
         {"sec": 0, "nanosec": 250_000_000},
         {"sec": 2, "nanosec": 0},
     ]
+
+
+def test_a_force_beyond_the_drives_is_told_with_the_greatest_that_they_exert():
+    hand = load_hand("allegro")
+    grasp = load_shipped_grasp("jug", "allegro")
+    efforts = squeeze(hand, grasp, 4.0).torques.abs() / 0.7  # [N m] of each drive, in its URDF
+    most = 4.0 / float(efforts.max())
+    format_trajectories(hand, grasp, 0.99 * most)  # and warns of nothing
+    with pytest.warns(NoEffect, match=rf"force: 100 N .*at most {most:.2g} N are exerted"):
+        format_trajectories(hand, grasp, 100.0)
+    failed = dataclasses.replace(grasp, status=torch.tensor([int(Status.OBJECT_COLLISION)]))
+    for few in (grasp[:0], failed):
+        format_grasps(hand, few, 100.0)  # nobody plays it
 
 
 def test_a_motion_of_another_hand_is_refused():

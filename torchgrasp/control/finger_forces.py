@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.balance import least_friction_forces
-from torchgrasp.foundation.base import Value, named_tensors, settle
+from torchgrasp.foundation.base import Value, count_status, named_tensors, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Force, Positive, check_dense, is_known
@@ -151,6 +151,22 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
     points, normals = contacts_in_hand(grasps)
     forces = desired_forces(points, normals, force)
     return press(joints, hand.jacobian(joints, points), forces, joint_stiffness(hand, kp))
+
+
+def check_all_executable(grasps: Grasps) -> None:
+    """Raise `BadArgument` if one of the grasps failed a check of the planner (`Grasps.status`).
+
+    A robot would play a failed grasp, too, where a format or a controller knows no status. Imported
+    grasps (`grasps_from_joints`) may lack force closure, since their true contacts are unknown.
+    """
+    planned = "seed" in grasps.meta
+    taken = {Status.OK} if planned else {Status.OK, Status.NOT_CLOSED}
+    failed = {s: k for s, k in count_status(grasps.status).items() if s not in taken}
+    if failed:
+        causes = ", ".join(f"{k} {s.name}" for s, k in failed.items())
+        found = f"{sum(failed.values())} of {len(grasps)} that failed ({causes})"
+        allowed = "executable grasps, as grasps.executable or grasps.best"
+        raise BadArgument("grasps", found, allowed)
 
 
 def check_same_hand(hand: Hand, grasps: Grasps) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import NOISE, Observation
-from torchgrasp.hand.drives import drive_efforts
+from torchgrasp.hand.drives import strongest_leads
 
 SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
 POSE_TIME = 0.4  # time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze
@@ -124,7 +124,4 @@ def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
     """Return, for each of h actuated joints, the target minus position [rad] at which its drive
     exerts its largest torque.
     """
-    hand = reference.hand
-    # infinite where nothing is driven: (j, h)
-    leads = (drive_efforts(hand) / reference.kp)[:, None] / hand.actuated.coupling.abs()
-    return leads.amin(0)
+    return strongest_leads(reference.hand, reference.kp)

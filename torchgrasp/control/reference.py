@@ -117,6 +117,7 @@ class ClosingReference(Value):
         Raises `BadArgument` for:
 
         * not exactly one grasp, or a grasp of another hand or other fingers;
+        * a grasp that failed a check: a robot would play it, too;
         * a hand whose geometry has changed since the plan;
         * joints beyond their limits, or numbers in the grasp that are not finite;
         * contacts without `std_m`;
@@ -125,6 +126,7 @@ class ClosingReference(Value):
         * a `stability` for other than three fingers.
         """
         check_single(grasp)
+        finger_forces.check_all_executable(grasp)
         finger_forces.check_same_hand(hand, grasp)
         contacts = grasp.contacts
         check_tensor("grasp.contacts.points", contacts.points, (1, len(hand.tips), 3))

@@ -40,6 +40,8 @@ class RegraspNumbers:
     """Share of the object's mass that may be concentrated at one surface point."""
     withdrawal: float = 0.6
     """Time [s] in which the opened hand withdraws, and the object rests."""
+    same: float = 1e-3
+    """Largest difference [m, 1] between the poses of a grasp and of its controller: rounding."""
     places: int = 64
     """Least number of surface points at which this mass is assumed in turn; fewer if the surface
     has fewer.
@@ -95,6 +97,15 @@ def _check_surface(grasps: Grasps, surface: SignedDistanceField | None) -> None:
         check_surface("surface", surface, points)
 
 
+def _check_started(controller: GraspController, grasp: Grasps) -> None:
+    """Raise `BadArgument` for a controller of another grasp: its fingers would close elsewhere."""
+    pose = controller.planned.obj_from_hand
+    off = float((grasp.obj_from_hand[0].to(pose) - pose).abs().max())
+    if off > REGRASP.same:
+        found = f"a controller of a grasp with another pose, off by {off:.2g}"
+        raise BadArgument("start", found, "a new controller of the grasp that `start` gets")
+
+
 def _chances(
     grasps: Grasps, table: Plane, surface: SignedDistanceField, tried: Sequence[int]
 ) -> Float[Tensor, "g"]:
@@ -142,7 +153,7 @@ class GraspTry:
 
     Raises `BadArgument` if `tried` is empty, or an index in it is none of the grasps. Raises it if
     the grasp of this try failed a check of the planner, or if the surface is over 50 mm off the
-    contacts.
+    contacts. Raises it for a `start` whose controller is of another grasp.
     """
 
     @checked
@@ -170,6 +181,7 @@ class GraspTry:
             torch.eye(4, dtype=torch.float64) if moved is None else moved.cpu().double().clone()
         )
         self.controller = start(grasps[self.row])
+        _check_started(self.controller, grasps[self.row])
         self.check = LiftCheck(self.controller.reference)
 
     @property

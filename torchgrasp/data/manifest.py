@@ -22,7 +22,7 @@ from torchgrasp.cloud.diagnose import DIAGNOSIS
 from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.files import Field, format_json, read_json, write_file
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import CloudWarning, DatasetError, TwoBodies
+from torchgrasp.foundation.errors import CloudWarning, DatasetError, NoEffect, TwoBodies
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Count, Seed
 from torchgrasp.foundation.told import warn_user
@@ -38,6 +38,10 @@ MOST_MASS = 1e4
 """Largest scale, its inverse being the least, largest coordinate [m] of a camera, and least and
 largest mass [kg].
 """
+MISNAMED = {"mass": "mass_kg", "scale": "suggested_scale"}
+"""Names that others give to entries of an object, which are not read, and our names."""
+UNREAD = (".glb", ".gltf", ".dae", ".3mf", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".step")
+"""Endings of meshes that `write_objects` does not read."""
 NAME_BYTES = 100  # longest name: file names have 255 bytes
 SHOWN_NAMES = 100  # most names that an error message quotes
 
@@ -115,14 +119,21 @@ def read_entries(
 
     An object whose entry in the manifest is malformed has the `DatasetError` in place of its
     description. `only` are the names of the objects; empty means all. Raises `DatasetError` for a
-    missing or malformed manifest, or one that lacks an object of `only`.
+    missing or malformed manifest, or one that lacks an object of `only`. `NoEffect` warns of a
+    "mass" or a "scale", which are not read, where "mass_kg" or "suggested_scale" is missing.
     """
+    fields = _read_fields(objects, only)
     found: dict[str, ObjectEntry | DatasetError] = {}
-    for name, field in sorted(_read_fields(objects, only).items()):
+    for name, field in sorted(fields.items()):
         try:
             found[name] = _parse_entry(name, field)
         except DatasetError as error:
             found[name] = error
+    for theirs, ours in MISNAMED.items():
+        values = [fields[name].value for name in found if not isinstance(found[name], DatasetError)]
+        if count := sum(theirs in value and ours not in value for value in values):
+            told = f"{theirs!r} of {count} objects is not read: call it {ours!r}"
+            warn_user(NoEffect, f"{Path(objects) / 'manifest.json'}: {told}")
     return found
 
 
@@ -169,10 +180,12 @@ def write_objects(
         seed: seed of the camera directions and of the noise.
 
     Warns of a mesh that is longer than 0.4 m or falls over (`CloudWarning`). Warns also of a mesh
-    whose bodies do not touch each other (`TwoBodies`).
+    whose bodies do not touch each other (`TwoBodies`). `NoEffect` warns of meshes of other formats
+    or in folders, which are not read.
 
     Raises:
         DatasetError: there are no meshes, or two meshes of one name.
+        DatasetError: `out` has a manifest with other objects, or with entries besides "views".
         MeshError: a mesh is malformed, open or without volume.
         OutputError: the folder cannot be written.
 
@@ -193,6 +206,14 @@ def write_objects(
             found = f"{meshes}, {missing}"
         allowed = f"a folder of files {', '.join(SUFFIXES)}, each of its own name"
         raise DatasetError("meshes", found, allowed)
+    _check_replaced(Path(out), names)
+    written = {Path(out).resolve(), *((Path(out) / name).resolve() for name in names)}
+    if left := [path.name for path in sorted(Path(meshes).iterdir()) if _is_left(path, written)]:
+        shown = ", ".join(left[:SHOWN_NAMES])
+        fix = f"put files {', '.join(SUFFIXES)} into {meshes} itself"
+        warn_user(
+            NoEffect, f"{len(left)} files or folders with meshes are not read, {shown}: {fix}"
+        )
     generator = torch.Generator().manual_seed(seed)
     entries = dict[str, object]()
     for path in files:
@@ -202,6 +223,34 @@ def write_objects(
         entries[path.stem] = {"views": poses}
     write_file(Path(out) / "manifest.json", format_json({"objects": entries}))
     return names
+
+
+def _check_replaced(out: Path, names: Sequence[str]) -> None:
+    """Raise `DatasetError` if the folder `out` has a manifest from which more than views would be
+    lost: other objects than `names`, or what a user has added.
+    """
+    if not (out / "manifest.json").is_file():
+        return
+    lost = [
+        name
+        for name, entry in _read_fields(out, ()).items()
+        if name not in names or entry.entries().keys() != {"views"}
+    ]
+    if lost:
+        shown = ", ".join(lost[:SHOWN_NAMES])
+        found = f"{out} with a manifest whose objects or entries would be lost, {shown}"
+        raise DatasetError("out", found, "a new folder, or one that the same meshes made")
+
+
+def _is_left(path: Path, written: set[Path]) -> bool:
+    """Return whether a path holds meshes that are not read: a file of another format, or a folder.
+
+    Folders that are `written` do not count.
+    """
+    if path.is_dir():
+        some = () if path.resolve() in written else path.iterdir()
+        return any(file.suffix.lower() in (*SUFFIXES, *UNREAD) for file in some)
+    return path.suffix.lower() in UNREAD
 
 
 def _write_object(

@@ -346,7 +346,9 @@ def derive_reference(
         max_force: greatest normal force [N] of a fingertip; None means no limit.
     """
     preference = choose_preference(hand, closing)
-    plan = ClosingReference.from_grasp(hand, grasp, force, kp, preference)
+    # a simulation may show how a grasp ends that failed a check
+    tried = dataclasses.replace(grasp, status=torch.zeros_like(grasp.status))
+    plan = ClosingReference.from_grasp(hand, tried, force, kp, preference)
     table = table and table.moved(inverse(grasp.obj_from_hand[0]))
     sensor = sensor or plan.sensor
     return dataclasses.replace(

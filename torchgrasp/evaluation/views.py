@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.camera import look_at
+from torchgrasp.control.finger_forces import check_all_executable
 from torchgrasp.data import read_entry, read_object_mesh, read_view
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.evaluation.protocols import Protocol, draw_error, draw_slide, seed_of
@@ -72,8 +73,8 @@ class EvaluationSpec(Value):
             They are the views "whole" of `read_view`.
         only: names of the objects to evaluate; empty means all.
         planned: whether to read the grasps that an earlier call of `evaluate` saved in its
-            `folder`, instead of planning. A view whose file is missing or of another cloud or hand
-            is refused (`BAD_OBJECT`).
+            `folder`, instead of planning. A view whose file is missing, of another cloud or hand,
+            or with failed grasps is refused (`BAD_OBJECT`).
         seed: seed of the planner, of the random pose errors of the trials (`PoseNoise`), and of the
             trials.
         views: largest number of views of each object, the first by name. None means all views.
@@ -244,11 +245,15 @@ def plan_view(
 
 
 def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -> PlannedView:
-    """Read the grasps of a view that an earlier call planned with the same cloud and hand."""
+    """Read the grasps of a view that an earlier call planned with the same cloud and hand.
+
+    Failed grasps are refused: they would count as executable.
+    """
     grasps = load_grasps(path)
     made = {"cloud_sha256": digest(cloud), "hand_sha256": hand.source.sha256}
     if {key: grasps.meta.get(key) for key in made} != made:
         raise BadArgument("folder", f"{path} of another cloud or hand", "grasps of this view")
+    check_all_executable(grasps)
     reason = Status.__members__.get(grasps.meta.get(REFUSAL, ""), Status.OUT_OF_REACH)
     refusal = Status.OK if len(grasps) else reason
     fingers = grasps.meta.get("finger_names", "")

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchgrasp.arm.arm import Arm
 from torchgrasp.arm.reach import track, way_of
+from torchgrasp.control.finger_forces import check_all_executable
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.postures import named_postures
 from torchgrasp.foundation.base import Value, flatnonzero
@@ -64,14 +65,15 @@ def plan_motion(
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
 
     Raises `BadArgument` for grasps that were planned without this arm, or with another pose of its
-    base. It is also raised for joints of another hand, and for an approach that the arm cannot
-    follow.
+    base. It is also raised for grasps that failed a check, for joints of another hand, and for an
+    approach that the arm cannot follow.
 
     >>> grasps = plan_grasps(cloud, hand, spec, arm=arm)  # doctest: +SKIP
     >>> motion = plan_motion(arm, hand, grasps[:1])  # doctest: +SKIP
     >>> motion.phases  # doctest: +SKIP
     {'above': 0, 'pregrasp': 8, 'grasp': 9, 'squeeze': 10, 'lift': 18}
     """
+    check_all_executable(grasps)
     arm = arm.to("cpu", torch.float64)
     grasps = grasps.to("cpu", torch.float64)
     if grasps.arm is None or not _holds(arm, grasps.arm, grasps.obj_from_hand):

@@ -18,8 +18,8 @@ import yaml
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.control.finger_forces import check_all_executable
 from torchgrasp.export.postures import (
-    check_all_executable,
     check_flange,
     check_still,
     named_postures,

@@ -16,7 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.export.postures import check_all_executable, named_postures, quaternion
+from torchgrasp.control.finger_forces import check_all_executable
+from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import format_json, write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status

@@ -15,9 +15,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.agreement import check_contacts
+from torchgrasp.control.finger_forces import check_all_executable
 from torchgrasp.control.holding import PUSH
 from torchgrasp.control.protocol import POSE_TIME
-from torchgrasp.export.postures import check_all_executable, named_postures, quaternion
+from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import render, write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument

@@ -11,17 +11,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.control.finger_forces import Squeeze, squeeze
+from torchgrasp.control.finger_forces import Squeeze, check_all_executable, squeeze
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.files import format_json
-from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument, NoEffect, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Force, Pose, Positive
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.geometry.linalg import check_unit_vectors, norm
-from torchgrasp.hand.drives import stiff_drives
+from torchgrasp.hand.drives import drive_stiffness, stiff_drives, strongest_leads
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.urdf import read_urdf
@@ -72,6 +72,7 @@ def format_grasps(
     Raises `BadArgument` for joints of another hand, and for names that are unknown, empty or equal.
     It is also raised for a `force` outside 0.01 to 100 N, or a `kp` that is not positive. It is
     raised for a flange beyond 1 m, and for executable grasps whose joints exceed their limits.
+    `NoEffect` warns, as in all exports, of a `force` that the drives of the hand cannot exert.
 
     >>> import json
     >>> from torchgrasp import load_hand
@@ -160,34 +161,20 @@ def named_postures(
 
     `force` [N] is the normal force of the strongest finger at the squeeze. `kp` [N m/rad] is the
     stiffness of every drive; None means the hand's own. Raises `BadArgument` for joints of
-    executable grasps beyond their limits, or an approach that is no unit vector.
+    executable grasps beyond their limits, or an approach that is no unit vector. `NoEffect` warns
+    of a force that the drives cannot exert in an executable grasp.
     """
     hand = hand.to("cpu")
     grasps = grasps.to("cpu")
     squeezed = squeeze(hand, grasps, force, kp)
     _check_executable(hand, grasps.executable)
+    _tell_weak(hand, grasps, squeezed, force, kp)
     postures = {
         "pregrasp": grasps.pregrasp.double(),
         "grasp": grasps.joints.double(),
         "squeeze": squeezed.joints,
     }
     return squeezed, {name: hand.expand(joints) for name, joints in postures.items()}
-
-
-def check_all_executable(grasps: Grasps) -> None:
-    """Raise `BadArgument` if one of the grasps failed a check of the planner (`Grasps.status`).
-
-    Exports call it for formats without a status: a robot would play a failed grasp, too. Imported
-    grasps (`grasps_from_joints`) may lack force closure, since their true contacts are unknown.
-    """
-    planned = "seed" in grasps.meta
-    taken = {Status.OK} if planned else {Status.OK, Status.NOT_CLOSED}
-    failed = {s: k for s, k in count_status(grasps.status).items() if s not in taken}
-    if failed:
-        causes = ", ".join(f"{k} {s.name}" for s, k in failed.items())
-        found = f"{sum(failed.values())} of {len(grasps)} that failed ({causes})"
-        allowed = "executable grasps, as grasps.executable or grasps.best"
-        raise BadArgument("grasps", found, allowed)
 
 
 def _check_executable(hand: Hand, grasps: Grasps) -> None:
@@ -198,6 +185,24 @@ def _check_executable(hand: Hand, grasps: Grasps) -> None:
     limits.check_limits(grasps.joints.double(), "grasps.joints")
     limits.check_limits(grasps.pregrasp.double(), "grasps.pregrasp")
     check_unit_vectors("grasps.approach", grasps.approach.double())
+
+
+def _tell_weak(
+    hand: Hand, grasps: Grasps, squeezed: Squeeze, force: float, kp: float | None
+) -> None:
+    """Warn of a normal `force` [N] for which a drive would exceed its largest torque in an
+    executable grasp.
+    """
+    leads = strongest_leads(hand, drive_stiffness(hand, kp))
+    shares = (squeezed.joints - grasps.joints.double()).abs() / leads
+    shares = shares[grasps.status == Status.OK]
+    if not len(shares) or not (shares > 1).any():
+        return
+    worst = shares.amax(0)
+    name = hand.joint_names[int(worst.argmax())]
+    most = float(worst.max())
+    asked = f"{force:g} N need {most:.1f} times the effort of {name}"
+    warn_user(NoEffect, f"force: {asked}: at most {force / most:.2g} N are exerted")
 
 
 def check_flange(flange: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:

@@ -11,10 +11,10 @@ import yaml
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.control.finger_forces import check_all_executable
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.arm_motion import ArmMotion
 from torchgrasp.export.postures import (
-    check_all_executable,
     check_flange,
     check_still,
     follower_joints,

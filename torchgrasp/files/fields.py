@@ -9,6 +9,7 @@ import functools
 import json
 import sys
 import typing
+from collections import Counter
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -139,13 +140,18 @@ class Field(NamedTuple):
 def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) -> Field:
     """Return the content of a JSON file as a field.
 
-    The file must be in UTF-8, with at most `most` bytes, by default 32 MiB (`JSON_BYTES`), and no
-    NaN or infinity. For another file the error `refuse(found, allowed)` is raised, and later for
-    each bad value of the field. `allowed` says what is expected.
+    The file must be in UTF-8, with at most `most` bytes, by default 32 MiB (`JSON_BYTES`). It has
+    no NaN or infinity, and each name once in its object. For another file the error
+    `refuse(found, allowed)` is raised, and later for each bad value of the field. `allowed` says
+    what is expected.
     """
     data = read_bounded(path, most, allowed, refuse)
     try:
-        value = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
+        value = json.loads(
+            data.decode("utf-8"),
+            parse_constant=_refuse_constant,
+            object_pairs_hook=_refuse_doubles,
+        )
     except (ValueError, RecursionError) as error:
         raise refuse(f"{path}: {error}", allowed) from error
     return Field(path, "", value, refuse)
@@ -154,6 +160,17 @@ def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) 
 def _refuse_constant(name: str) -> float:
     """Raise `ValueError` for NaN and Infinity, which Python's reader would accept."""
     raise ValueError(f"{name}, which is no JSON")
+
+
+def _refuse_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object; raise `ValueError` for a name that it has twice, of which Python's
+    reader would keep the last value alone.
+    """
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        name, _ = Counter(name for name, _ in pairs).most_common(1)[0]
+        raise ValueError(f"{name[:SHOWN_LETTERS]!r} twice in one object")
+    return found
 
 
 def save_tensors(

@@ -40,6 +40,17 @@ def drive_efforts(hand: Hand) -> Float[Tensor, " j"]:
     return torch.tensor(efforts, dtype=torch.float64, device="cpu")
 
 
+def strongest_leads(hand: Hand, drives: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
+    """Return, for each of h actuated joints, the target minus position [rad] at which a drive that
+    moves with it exerts its largest torque.
+
+    `drives` (j,) [N m/rad] are the stiffnesses of the drives of all j movable joints of the URDF.
+    """
+    # infinite where nothing is driven: (j, h)
+    leads = (drive_efforts(hand) / drives)[:, None] / hand.actuated.coupling.abs()
+    return leads.amin(0)
+
+
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
     """Return the stiffness (h,) [N m/rad] of each of h actuated joints, together with the joints
     coupled to it.

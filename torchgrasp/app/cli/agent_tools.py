@@ -63,9 +63,8 @@ from torchgrasp.app.cli.results import (
     table_under,
     write_run,
 )
-from torchgrasp.app.report.run_data import verdict
+from torchgrasp.app.report.run_data import VIEW, verdict
 from torchgrasp.app.report.stills import draw_grasp, facing, rotated
-from torchgrasp.app.report.viewer import VIEW
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.contacts.region import Region

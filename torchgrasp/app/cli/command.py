@@ -132,8 +132,8 @@ def _metavar(kind: Any) -> str:
 def execute(command: Command) -> int:
     """Check a command's arguments by their annotations, then run it; return the exit code.
 
-    Errors name the command-line options. Raises `BadArgument` for a number out of its range, or an
-    invalid path.
+    Errors name the command-line options. Raises `BadArgument` for a number out of its range, an
+    invalid path, or an --out that is a file which the command reads.
     """
     fields = {f.name: f for f in dataclasses.fields(command) if "help" in f.metadata}  # pyright: ignore[reportArgumentType]
     options = {
@@ -144,7 +144,25 @@ def execute(command: Command) -> int:
     with naming(**names), _speaking(command):
         for name, field in fields.items():
             check_value(name, getattr(command, name), field.type)
+        out = getattr(command, "out", None)
+        if isinstance(out, Path):
+            read = (value for name, value in vars(command).items() if name != "out")
+            check_kept(out, *read)
         return command.run()
+
+
+def check_kept(out: Path, *read: Any) -> None:
+    """Raise `BadArgument`, which names --out, if the file `out` is one of those that are read.
+
+    Among the values `read`, paths count, also in tuples and in dataclasses of options.
+    """
+    for value in read:
+        if isinstance(value, tuple):
+            check_kept(out, *value)
+        elif dataclasses.is_dataclass(value):
+            check_kept(out, *vars(value).values())
+        elif isinstance(value, Path) and out.is_file() and value.is_file() and out.samefile(value):
+            raise BadArgument("--out", f"{out}, which is read", "another file: it would be lost")
 
 
 @arguments()

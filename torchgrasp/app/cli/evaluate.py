@@ -165,7 +165,8 @@ class Evaluate(_Trials, ForPrograms):
         """Return the protocol `test` with the displacement, push, second look and number of trials
         that the user set by options.
 
-        Raises `BadArgument` for --displaced with a protocol that does not lift.
+        Raises `BadArgument` for --displaced with a protocol that does not lift, and for --during
+        without a displacement.
         """
         noise = (
             test.noise if self.draws is None else dataclasses.replace(test.noise, draws=self.draws)
@@ -177,6 +178,8 @@ class Evaluate(_Trials, ForPrograms):
                 )
             with naming(translation="--displaced"):
                 noise = dataclasses.replace(noise, translation=self.displaced, rotation=0.0)
+        if self.during and not noise.translation:
+            raise BadArgument("--during", "no displacement", "--displaced beside it")
         push = test.push if self.push is None else self.push
         relook = self.relook or test.relook
         when = "approach" if self.during else test.displaced

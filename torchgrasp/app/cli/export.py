@@ -9,15 +9,23 @@ from typing import Any, Literal
 import numpy as np
 
 from torchgrasp import export as formats
-from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
-from torchgrasp.app.cli.results import PLANNED_HELP, load_planned
+from torchgrasp.app.cli.command import (
+    Command,
+    arguments,
+    check_kept,
+    naming,
+    option,
+    positional,
+    required,
+)
+from torchgrasp.app.cli.results import GRASPS, PLANNED_HELP, load_planned
 from torchgrasp.app.report.glb import write_glb
 from torchgrasp.cloud.agreement import check_contacts
 from torchgrasp.export.foreign import read_poses
 from torchgrasp.export.postures import follower_joints, stands_still
 from torchgrasp.files import read_bytes, read_json, write_file
 from torchgrasp.foundation.errors import BadArgument, ModelFileError
-from torchgrasp.foundation.rules import Count
+from torchgrasp.foundation.rules import Count, check_suffix
 from torchgrasp.geometry.mesh import SUFFIXES, load_triangles, read_mesh
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
@@ -121,6 +129,7 @@ class Export(Command):
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return 0, or 1 for no grasp."""
         planned, surface = load_planned(self.grasps)
+        check_kept(self.out, surface.with_name(GRASPS), surface)
         replaced = (self._plays or self.format == "glb") and surface.is_file()
         if self._needs_object and self.object is None and not replaced:
             raise BadArgument("--object", None, f"a path with --format {self.format}")
@@ -130,6 +139,8 @@ class Export(Command):
         taken = trial if self._plays else texts
         if unused := [name for name in (*robot, *trial) if name not in taken]:
             raise BadArgument(unused[0], f"--format {self.format}", "a format that it is for")
+        if self.format == "glb":
+            check_suffix("--out", self.out, ".glb")
         hand = hand_of(planned, self.hand)
         if planned.meta.get("hand_sha256") != hand.source.sha256:
             other = f"{hand.name}, whose files are not those that were planned with"

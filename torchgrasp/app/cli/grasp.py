@@ -30,7 +30,7 @@ from torchgrasp.app.cli.results import (
     table_under,
     write_run,
 )
-from torchgrasp.app.report.run_data import Run, grasp_columns, grasp_rows, verdict
+from torchgrasp.app.report.run_data import RECORDING, Run, grasp_columns, grasp_rows, verdict
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.pose import find_plausible
 from torchgrasp.data.shipped import find_view
@@ -246,6 +246,8 @@ class Grasp(ForPrograms):
         beside = [name for name, given in others.items() if given]
         if self.edge is not None and beside:
             raise BadArgument("--edge", f"{beside[0]} beside it", "one of the two")
+        if self.edge is None and self.table_friction != Grasp.table_friction:
+            raise BadArgument("--table-friction", "no --edge beside it", "both, or neither")
 
     def _grasp_cloud(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
         """Plan on a point cloud and write the results; return the exit code."""
@@ -547,7 +549,7 @@ class Grasp(ForPrograms):
         if self.rerun:
             from torchgrasp.app.report.recording import write_recording
 
-            paths.append(write_recording(out / "run.rrd", run))
+            paths.append(write_recording(out / RECORDING, run))
         return ", ".join(map(str, paths))
 
     def _find_easiest(

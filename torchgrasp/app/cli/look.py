@@ -6,7 +6,7 @@ import webbrowser
 from pathlib import Path
 
 from torchgrasp.app.cli.command import Command, arguments, option, positional
-from torchgrasp.app.report.viewer import VIEW
+from torchgrasp.app.report.run_data import VIEW
 from torchgrasp.data.shipped import DATA, MASSES, list_objects
 from torchgrasp.foundation.errors import BadArgument
 

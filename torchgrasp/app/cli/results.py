@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from torchgrasp.app.cli.command import naming
-from torchgrasp.app.report.run_data import Run, verdict
+from torchgrasp.app.report.run_data import RECORDING, VIEW, Run, verdict
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.data.shipped import DATA, list_objects, load_object
 from torchgrasp.export import save_surface
 from torchgrasp.export.play import stand
-from torchgrasp.files import sha256
+from torchgrasp.files import remove_file, sha256
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
@@ -81,15 +81,18 @@ def write_run(out: Path, run: Run, pages: bool) -> list[Path]:
     """Write the grasps of a run into the folder `out`; return the paths of all files.
 
     The estimated surface is written, too, if a grasp passed all checks. With `pages`, an HTML
-    report and a 3D page are written for a person.
+    report and a 3D page are written for a person. The other files of an earlier run are removed:
+    they would show another plan beside these grasps.
     """
+    for name in (SURFACE, REPORT, VIEW, RECORDING):
+        remove_file(out / name)
     paths = [out / GRASPS]
     run.grasps.save(paths[0])
     if len(run.executable):
         paths.append(save_surface(stand(run.surface, run.grasps.table), out / SURFACE))
     if pages:
         from torchgrasp.app.report.page import write_report  # they take long to import
-        from torchgrasp.app.report.viewer import VIEW, write_viewer
+        from torchgrasp.app.report.viewer import write_viewer
 
         paths += [write_report(out / REPORT, run, VIEW), write_viewer(out / VIEW, run)]
     return paths

@@ -21,6 +21,9 @@ from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.planning import ContactPlan, Grasps, PointCloud, format_success
 from torchgrasp.values.specs import ContactSpec
 
+VIEW = "view.html"
+RECORDING = "run.rrd"
+"""Names of the 3D page and of the recording of a run, beside its grasps."""
 GRASP_COLUMNS = (
     "rank",
     "success",

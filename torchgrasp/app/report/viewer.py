@@ -43,8 +43,6 @@ from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ContactSpec
 
-VIEW = "view.html"  # name of the page beside the report
-
 
 @dataclasses.dataclass(frozen=True)
 class ViewerNumbers:
