@@ -1,8 +1,6 @@
 #!/usr/bin/env python
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
-* close: table-lift, success, edge: lifts, predicted success, low bodies near a corner
-
 * headline: lifts, low, pulls, region, rendered, real, pace: what README says; --publish writes it
 
 * gpu: clouds, launches: many clouds at once, also without a GPU
@@ -23,7 +21,7 @@ import tyro
 from benchmarks.common import Options, measure
 from benchmarks.headline.page import write_headline
 
-SUBJECTS = ("close", "gpu", "headline", "plan", "scene")
+SUBJECTS = ("gpu", "headline", "plan", "scene")
 
 
 def command(subject: str) -> Callable[[Options], None]:

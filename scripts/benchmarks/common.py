@@ -73,13 +73,11 @@ class Options:
         names: objects to keep; by default all.
         views: names of the views that are measured, as view0; by default all.
         hands: names of hands.
-        conditions: of close/table-lift; by default all.
         starts: random starts of the contact planner.
         batches: numbers of clouds of gpu/clouds and gpu/launches.
         scale: factor of the numbers of random samples, scenes, frames, plans and trials.
-        draws: trials of each grasp of close/table-lift, with other displacements and noise.
         clouds: folder of real clouds NAME_CAMERA.ply for headline/real, of one camera each.
-        simulator: of close/table-lift.
+        simulator: of headline/region and scene/target.
         workers: processes that share the trials.
         threads: of torch.
         beside: commit whose times plan/pace takes in the same run, for ratios; with publish they
@@ -94,11 +92,9 @@ class Options:
     names: tuple[str, ...] = ()
     views: tuple[str, ...] = ()
     hands: tuple[str, ...] = ("allegro", "barrett")
-    conditions: tuple[str, ...] = ()
     starts: int = 1000
     batches: tuple[int, ...] = (1, 4, 16)
     scale: float = 1.0
-    draws: int = 5
     clouds: Path | None = None
     simulator: Literal["sapien", "mujoco"] = "sapien"
     workers: int = 1
@@ -141,7 +137,7 @@ class Bench(NamedTuple):
 
 
 BENCHES: dict[str, Bench] = {}
-"""All benches by name, as "close/table-lift"."""
+"""All benches by name, as "scene/rooms"."""
 
 
 def bench(name: str, objects: bool = False) -> Callable[[Callable[[Options], list[Row]]], Callable]:
@@ -158,7 +154,7 @@ def bench(name: str, objects: bool = False) -> Callable[[Callable[[Options], lis
 
 
 def benches_of(subject: str) -> dict[str, Bench]:
-    """Return the benches of a subject by their names without the subject, such as "table-lift"."""
+    """Return the benches of a subject by their names without the subject, such as "rooms"."""
     package = importlib.import_module(f"benchmarks.{subject}")
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"benchmarks.{subject}.{module.name}")

@@ -13,9 +13,9 @@ import torch
 import trimesh
 from bench import SUBJECTS
 from benchmarks import common
-from benchmarks.close.table_lift import are_kept
 from benchmarks.common import Options, Row, benches_of, keep_rows, measure, write_section
 from benchmarks.ground_truth import read_views, sample_hidden
+from benchmarks.headline.lifts import are_kept
 from benchmarks.headline.shapes import measure_shape
 from benchmarks.plan import beside, timed
 from train.bands import fit_factor

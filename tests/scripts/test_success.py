@@ -7,8 +7,8 @@ import pytest
 import torch
 
 pytest.importorskip("sklearn")
-from benchmarks.close import success as bench
-from benchmarks.close.success import (
+from benchmarks.headline import predictions as bench
+from benchmarks.headline.predictions import (
     Cell,
     judge_order,
     judge_predictions,

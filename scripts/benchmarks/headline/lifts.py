@@ -3,18 +3,28 @@ second simulator. Also lifts of low bodies.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from train.household import household
 
-from benchmarks.close.table_lift import BASE, lift_objects
 from benchmarks.common import Options, Row, bench, keep_rows
 from benchmarks.headline.left_out import LEFT_OUT
-from torchgrasp.evaluation import PoseNoise, ViewScore
+from torchgrasp.data.manifest import read_entries
+from torchgrasp.evaluation import (
+    PROTOCOLS,
+    EvaluationSpec,
+    PoseNoise,
+    Protocol,
+    ViewScore,
+    evaluate,
+)
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
+from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
+
+BASE = PROTOCOLS["table-lift"]
 
 HANDS = {"allegro": 0.98, "barrett": 0.97, "leap": 0.97, "shadow": 0.97}
 """Hands, and the project's bars for the share that rises in place with up to three grasps."""
@@ -40,7 +50,7 @@ def lifts(o: Options) -> list[Row]:
     """Lift each object once with each hand and in each condition, with up to three grasps of one
     view.
     """
-    o = dataclasses.replace(o, names=o.names or LEFT_OUT, draws=1)
+    o = dataclasses.replace(o, names=o.names or LEFT_OUT)
     rows = [_tried(o, hand, "in place", "sapien", {}, bar) for hand, bar in HANDS.items()]
     rows.append(_tried(o, "allegro", "in place", "mujoco", {}, HANDS["allegro"]))
     for name, (changes, bar) in CONDITIONS.items():
@@ -55,7 +65,7 @@ def low(o: Options) -> list[Row]:
     folder = o.out / f"low_{count}"
     if not (folder / "manifest.json").is_file():
         household(folder, count, highest=HIGHEST)
-    o = dataclasses.replace(o, objects=(Path(folder),), names=(), draws=1)
+    o = dataclasses.replace(o, objects=(Path(folder),), names=())
     return [_tried(o, hand, "low bodies", "sapien", {}, bar) for hand, bar in LOW.items()]
 
 
@@ -63,16 +73,42 @@ def _tried(
     o: Options, hand: str, condition: str, simulator: str, changes: dict[str, Any], bar: float
 ) -> Row:
     """Return the row of one hand in one condition."""
-    protocol = dataclasses.replace(BASE, **changes)
+    protocol = dataclasses.replace(BASE, **changes).with_trial(simulator=simulator)
 
     def try_objects() -> list[Row]:
-        scores = lift_objects(o, load_hand(hand), protocol, simulator)
+        scores = lift_objects(o, load_hand(hand), protocol)
         return [row_of(hand, condition, simulator, scores, bar)]
 
     words = f"headline {hand} {condition} {simulator}"
     (row,) = keep_rows(o, words.replace(" ", "-"), try_objects)
     print(row, flush=True)
     return row
+
+
+def lift_objects(o: Options, hand: Hand, protocol: Protocol) -> list[ViewScore]:
+    """Lift each object by the grasps of one view under a protocol, and return a score for each.
+
+    The grasps are those that an earlier call kept in the folder `out`. If there are none, they are
+    planned and kept.
+    """
+    found = []
+    for folder in o.objects:
+        shelf = o.out / "table-lift" / f"{hand.name}_{folder.name}"
+        here = tuple(sorted({*o.names} & {*read_entries(folder)}))
+        if o.names and not here:
+            continue
+        kept = are_kept(shelf, here or read_entries(folder))
+        spec = EvaluationSpec(1, starts=o.starts, only=here, seed=o.seed, views=1, planned=kept)
+        found += evaluate(folder, hand, protocol, spec, folder=shelf, workers=o.workers)
+    return found
+
+
+def are_kept(shelf: Path, names: Iterable[str]) -> bool:
+    """Return whether a folder has the grasps of all named objects.
+
+    After a run that was cut off it has those of some. Then all are planned again.
+    """
+    return all(any((shelf / name).glob("*.safetensors")) for name in names)
 
 
 def row_of(

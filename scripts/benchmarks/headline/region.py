@@ -17,9 +17,9 @@ from paper.tables6_7 import format_points
 from paper.trials import CELL_SECONDS, Subject, TableSpec, read_solid, subjects
 from train.trials import half_of
 
-from benchmarks.close.success import table_spec
 from benchmarks.common import Options, Row, bench, keep, run_all, timed
 from benchmarks.headline.left_out import LEFT_OUT
+from benchmarks.headline.predictions import table_spec
 from torchgrasp import (
     ContactSpec,
     Grasps,

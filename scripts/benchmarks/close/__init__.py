@@ -1,1 +1,0 @@
-"""Benches of grasps that a simulated hand closes, lifts or pulls at, each with a target."""
