@@ -25,8 +25,8 @@ from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, CloudWarning, NoEffect, TooFewPoints
 from torchgrasp.foundation.told import warn_user
-from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import Points, Vector, dot, norm, unit, unit_of_any
+from torchgrasp.geometry.plane import move
 from torchgrasp.values.planning import PointCloud
 
 FACING = 0.9  # least share of a view's normals that face the camera; noise turns some at the rim
@@ -511,17 +511,6 @@ def _view_in_frame(cloud: PointCloud, obj_from_cloud: Transform) -> PointCloud:
     """Return a view, with unit normals, transformed into the frame of the merged cloud."""
     cloud = estimate_normals(cloud) if cloud.normals is None else cloud
     assert cloud.normals is not None
-    pose = obj_from_cloud.to(cloud.points).double()
-    dtype = cloud.points.dtype
-    points = apply(pose, cloud.points.double())
-    normals = rotate(pose, unit_of_any(cloud.normals.double()))
-    viewpoint = cloud.viewpoint
-    if viewpoint is not None:
-        placed = apply(pose, viewpoint.double().reshape(-1, 3))
-        viewpoint = placed.reshape(viewpoint.shape).to(dtype)
-    frustum = cloud.frustum
-    if frustum is not None:
-        turned = rotate(pose, frustum.double().reshape(-1, 3))
-        frustum = turned.reshape(frustum.shape).to(dtype)
-    error = cloud.pose_error
-    return PointCloud(points.to(dtype), normals.to(dtype), viewpoint, frustum, error)
+    exact = cloud.to(torch.float64)
+    exact = dataclasses.replace(exact, normals=unit_of_any(cloud.normals.double()))
+    return move(exact, obj_from_cloud.to(cloud.points)).to(cloud.points.dtype)

@@ -27,6 +27,7 @@ from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import rotation_angle, rotation_from_vector, turned_about
 from torchgrasp.geometry.linalg import Points, Vector, dot, norm, unit
+from torchgrasp.geometry.plane import move
 from torchgrasp.values.planning import PointCloud
 
 
@@ -250,17 +251,9 @@ def align_views(views: Sequence[PointCloud]) -> list[tuple[Float[Tensor, "4 4"],
         if motion is not None and motion.shown:
             motions[k] = (motion.pose, motion.unsure)
             _tell_motion(k, motion)
-            view = _move(view, motion.pose)
+            view = move(view, motion.pose)
         placed.append(view)
     return motions
-
-
-def _move(view: PointCloud, pose: Float[Tensor, "4 4"]) -> PointCloud:
-    """Return a view with its points and normals moved; its camera stays, which is not needed."""
-    assert view.normals is not None
-    turn = pose[:3, :3].to(view.points)
-    points = view.points @ turn.T + pose[:3, 3].to(turn)
-    return dataclasses.replace(view, points=points, normals=view.normals @ turn.T)
 
 
 def _tell_motion(number: int, motion: Motion) -> None:

@@ -27,9 +27,9 @@ from torchgrasp.files import hold_folder
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError
 from torchgrasp.foundation.limits import MAX_EXTENT
-from torchgrasp.geometry.frames import apply, real, rotate
+from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.linalg import norm, unit
-from torchgrasp.geometry.plane import Plane, as_plane
+from torchgrasp.geometry.plane import Plane, as_plane, move
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
 from torchgrasp.values.distribution import Distribution
@@ -303,10 +303,7 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
             "in another frame, --viewpoint X Y Z"
         )
         raise BadArgument(name, f"{unseen:.0%} of the points out of a camera's sight", allowed)
-    normals = None if cloud.normals is None else rotate(pose, cloud.normals)
-    frustum = None if cloud.frustum is None else rotate(pose, cloud.frustum)
-    eye = pose[:3, 3].clone()
-    return PointCloud(apply(pose, cloud.points), normals, eye, frustum, cloud.pose_error)
+    return dataclasses.replace(move(cloud, pose), viewpoint=pose[:3, 3].clone())
 
 
 def read_region(name: str, text: str | None) -> Region | None:
