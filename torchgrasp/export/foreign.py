@@ -29,7 +29,7 @@ from torchgrasp.export.file_joints import (
 from torchgrasp.export.isaac import parse_isaac
 from torchgrasp.export.other_formats import bench_frame
 from torchgrasp.export.postures import CONVENTIONS, OWN_FORMAT, OWN_VERSION
-from torchgrasp.files import Field, is_file, read_bytes, read_json
+from torchgrasp.files import Field, read_bounded, read_json
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, GraspFileWarning, ModelFileError, Status
@@ -85,7 +85,7 @@ GRIPPER_TIMES = ("result_time", "runtime", "timestamp")  # known, too
 BENCH_READ = ("grasp_qpos", "pregrasp_qpos", "obj_pose")
 BENCH_NAMES = "joint_names"  # array with the names of the joints in the order of a posture
 BENCH_KNOWN = ("obj_path", "obj_scale", "squeeze_qpos", BENCH_NAMES)
-BENCH_FILE = "an .npz of at most 512 MiB with 'grasp_qpos'"
+BENCH_FILE = "an .npz with 'grasp_qpos'"
 MOST_JOINTS = 100  # most names of joints that are read
 MOST_SHOWN = 200  # letters of these names in an error
 _refuse = functools.partial(ModelFileError, "path")  # the error of a bad file of grasps
@@ -348,7 +348,7 @@ def _read_bench(
     several.
     """
     bench_from_root, known = bench_frame(hand)
-    data = _bench_bytes(path)
+    data = read_bounded(path, CLOUD_BYTES, BENCH_FILE, _refuse)
     order = order or _bench_joints(path, data, hand)
     # the signs of a hand whose frame is known are known, too
     columns = read_order(hand, order) if order else tuple(Column(x, turned=True) for x in known)
@@ -377,15 +377,6 @@ def _read_bench(
         wrist = inverse(placed["grasp_qpos"]) @ placed["pregrasp_qpos"]
         opened = _at_rest(hand, joints["pregrasp_qpos"], wrist)
     return ForeignGrasps(joints["grasp_qpos"], placed["grasp_qpos"], opened)
-
-
-def _bench_bytes(path: Path) -> bytes:
-    """Return the bytes of an .npz file of DexGraspBench; raise `ModelFileError` for a missing or
-    large one.
-    """
-    if not is_file(path) or path.stat().st_size > CLOUD_BYTES:
-        raise _refuse(f"{path}: no file, or a larger one", BENCH_FILE)
-    return read_bytes(path)
 
 
 def _bench_joints(path: Path, data: bytes, hand: Hand) -> tuple[str, ...]:
