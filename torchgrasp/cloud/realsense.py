@@ -74,8 +74,8 @@ def shoot_depth(serial: str | None = None, numbers: LiveCameraNumbers = SHOT) ->
         with _refusing(camera, "a camera that starts; plug it in anew"):
             sensor.start(queue)
         for _ in range(numbers.settle):
-            _take(sdk, queue, camera, numbers)
-        frames = [_take(sdk, queue, camera, numbers) for _ in range(numbers.frames)]
+            _take(queue, camera, numbers)
+        frames = [_take(queue, camera, numbers) for _ in range(numbers.frames)]
     finally:
         # a camera that was unplugged cannot be stopped
         with contextlib.suppress(RuntimeError):
@@ -140,7 +140,7 @@ def _find_mode(sdk: Any, sensor: Any, camera: str) -> Any:
     return next((mode for mode in modes if mode.is_default()), modes[0])
 
 
-def _take(sdk: Any, queue: Any, camera: str, numbers: LiveCameraNumbers) -> np.ndarray:
+def _take(queue: Any, camera: str, numbers: LiveCameraNumbers) -> np.ndarray:
     """Return the counts (h, w) of the next frame, as a copy: the camera uses its memory again."""
     wait = f"a frame within {numbers.patience / 1000:g} s; plug the camera in anew"
     with _refusing(camera, wait):

@@ -195,7 +195,7 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
 def largest_std(surface: Surface) -> float:
     """Return the standard deviation [m] at the upper end of the colour scale of `save_surface`.
 
-    It is the 99 % quantile over the vertices of the surface, at least 1e-6 m.
+    It is the 99 % quantile over the vertices of the surface, at least 1e-6 m. Reports use it, too.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.shape import extract_surface
@@ -203,7 +203,8 @@ def largest_std(surface: Surface) -> float:
     >>> 0.001 < largest_std(surface) < 0.05
     True
     """
-    return max(float(surface.std_m.double().quantile(QUANTILE)), LEAST_STD)
+    std = surface.std_m.double()
+    return max(float(std.quantile(QUANTILE)), LEAST_STD) if len(std) else LEAST_STD
 
 
 @checked

@@ -17,8 +17,11 @@ from torchgrasp.app.report.raster import (
     concatenate,
     render,
 )
+from torchgrasp.export.other_formats import largest_std
 from torchgrasp.foundation.lazy import Image, ImageDraw, ImageFont, matplotlib, trimesh
+from torchgrasp.geometry.frames import to_array
 from torchgrasp.geometry.plane import Plane, as_plane
+from torchgrasp.shape.surface import Surface
 
 Points = Float[np.ndarray, "n 3"]  # points [m], or colours in [0, 1]
 FINGERS = (
@@ -113,8 +116,6 @@ MARKS = MarkShapes()
 FRAMING = Framing()
 BAR = BarLayout()
 SMOOTH_BEND = 40.0  # faces that bend by less [degrees] look like one smooth surface
-STD_QUANTILE = 0.99  # of the standard deviations that a colour map spans: few outliers
-LEAST_STD = 1e-6  # least span of a colour map of standard deviations [m]
 PNG_LEVEL = 4  # of compression: higher is slower and hardly smaller
 
 
@@ -320,16 +321,15 @@ def map_colors(values: Float[np.ndarray, " n"], name: str) -> Points:
     return matplotlib.colormaps[name](values)[:, :3]
 
 
-def color_std(std_m: Float[np.ndarray, " n"]) -> tuple[Points, float]:
-    """Return the colours (n, 3) of standard deviations (n,) [m], and the value of the last colour
-    [m].
+def color_std(surface: Surface) -> tuple[Points, float]:
+    """Return the colours (v, 3) of a surface's standard deviations, and the value of the last
+    colour [m].
 
-    The colours are red, green and blue in [0, 1]. The value of the last one is the 99 % quantile of
-    the standard deviations; all greater ones have the same colour.
+    The colours are red, green and blue in [0, 1], one for each vertex. The value of the last one is
+    `largest_std(surface)`; all greater ones have the same colour.
     """
-    highest = float(np.quantile(std_m, STD_QUANTILE)) if len(std_m) else 0.0
-    most = max(highest, LEAST_STD)
-    return map_colors(std_m / most, "viridis"), most
+    most = largest_std(surface)
+    return map_colors(to_array(surface.std_m) / most, "viridis"), most
 
 
 def draw_bar(image: Any, title: str, most: float, colors: str) -> None:

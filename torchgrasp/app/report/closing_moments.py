@@ -63,6 +63,15 @@ def first_touches(closure: ClosureResult) -> list[int]:
     return [int(touched[:, finger].int().argmax()) for finger in closure.contact_order]
 
 
+def moved_from_place(closure: ClosureResult, centre: Float[Tensor, "3"]) -> Float[Tensor, " t"]:
+    """Return the distance (t,) [m] of the object's centre of mass from its first place, at each
+    control tick. `centre` (3,) [m] is the centre in the frame of the grasp.
+    """
+    middle = centre.double().expand(len(closure.time), 1, 3)
+    places = apply(closure.object_pose.double(), middle)[:, 0]  # (t, 3)
+    return norm(places - places[0])
+
+
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     """Return the index of the control tick at which the object was lost; None if it was held.
 
@@ -82,9 +91,7 @@ def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     if closure.status is Status.TOO_HEAVY:
         return int(closure.hand_pose[:, 2, 3].argmax())
     if closure.status is Status.EJECTED:
-        middle = centre.double().expand(len(closure.time), 1, 3)
-        world = apply(closure.object_pose.double(), middle)[:, 0]  # (t, 3)
-        away = norm(world - world[0]) > PUSHED_DISTANCE
+        away = moved_from_place(closure, centre) > PUSHED_DISTANCE
         return int(away.int().argmax()) if away.any() else last
     # else it slipped too far, or at most one finger still touched it: the earlier of both
     distance, angle = moved_in_hand(closure, centre)

@@ -15,13 +15,13 @@ from torchgrasp.app.report.closing_moments import (
     first_touches,
     mass_centre,
     moments_of,
+    moved_from_place,
 )
 from torchgrasp.app.report.closing_pictures import draw_ticks, finite_ticks
 from torchgrasp.app.report.raster import Direction
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.geometry.frames import apply, to_array
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.frames import to_array
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosureResult
@@ -245,13 +245,12 @@ def _list_plots(
         f"{order.index(k) + 1}. {name}" if k in order else f"never: {name}"
         for k, name in enumerate(names)
     ]
-    distance, turn = moved_in_hand(closure, mass_centre(mesh))
+    centre = mass_centre(mesh)
+    distance, turn = moved_in_hand(closure, centre)
     before = torch.arange(len(closure.time)) < tick_of(closure, 2)
     slip = to_array((1e3 * distance).masked_fill(before, torch.nan))
     degrees = to_array(torch.rad2deg(turn).masked_fill(before, torch.nan))
-    middle = mass_centre(mesh).expand(len(closure.time), 1, 3)
-    centres = apply(closure.object_pose.double(), middle)[:, 0]  # (t, 3)
-    moved = 1e3 * to_array(norm(centres - centres[0]))
+    moved = 1e3 * to_array(moved_from_place(closure, centre))
     height = 1e3 * to_array(closure.hand_pose[:, 2, 3])
     height = height - np.nanmin(height)
     forces = to_array(closure.forces)

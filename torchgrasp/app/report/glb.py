@@ -103,7 +103,7 @@ def _solid(body: "Surface | trimesh.Trimesh") -> "trimesh.Trimesh":
     """
     if not isinstance(body, Surface):
         return trimesh.Trimesh(body.vertices, body.faces, visual=_paint(OBJECT), process=False)
-    colors, _ = color_std(to_array(body.std_m))
+    colors, _ = color_std(body)
     vertices, faces, normals = mesh_arrays(body)
     return trimesh.Trimesh(
         vertices,

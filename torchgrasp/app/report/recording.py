@@ -104,7 +104,7 @@ class _Recorder:
         self._log(ROOT, rr.Transform3D(**at))
         cloud = rr.Points3D(to_array(run.cloud.points), colors=_bytes(CLOUD_COLOR))
         self._log(f"{ROOT}/cloud", cloud)
-        shades, _ = color_std(to_array(run.surface.std_m))
+        shades, _ = color_std(run.surface)
         surface = self._mesh(*mesh_arrays(run.surface), vertex_colors=np.uint8(FULL * shades))
         self._log(f"{ROOT}/surface", surface)
         if not len(run.executable):

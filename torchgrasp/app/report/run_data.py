@@ -10,7 +10,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Pose
-from torchgrasp.geometry.frames import inverse, real
+from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import move, upright_frame, upright_table
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.explain import Explanation
@@ -172,21 +172,17 @@ def verdict(run: Run) -> str:
 def closing_sentence(run: Run) -> str:
     """Return one sentence with the result of the closing on the true object.
 
-    The run must have a `closure` and a `mesh`. If the object was held, the sentence states its rise
-    [m] and its motion in the hand [mm, deg]. Otherwise it says why the object was not held.
+    The run must have a `closure`. If the object was held, the sentence states its rise [m] and its
+    motion in the hand [mm, deg]. Otherwise it says why the object was not held.
     """
-    upright = run.upright()
-    closure = upright.closure
-    mesh = upright.mesh
-    assert closure is not None and mesh is not None
+    closure = run.closure
+    assert closure is not None
     if not closure.held:
         reason = closure.status.sentence
         return f"The {run.hand.name} hand did not hold {run.named_object}: {reason}."
-    centre = real([*mesh.center_mass, 1.0])
-    rise = float((closure.object_pose[-1] - closure.object_pose[0])[2] @ centre)
     moved, angle = closure.object_motion
     return (
-        f"The {run.hand.name} hand held {run.named_object}: lifted {rise:.2f} m, "
+        f"The {run.hand.name} hand held {run.named_object}: lifted {closure.rise:.2f} m, "
         f"moved {1e3 * moved:.0f} mm and {math.degrees(angle):.0f} deg in the hand."
     )
 

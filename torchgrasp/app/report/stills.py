@@ -89,7 +89,7 @@ def draw_surface(
     camera. `table` is the level table, or its height z [m]; None means no table.
     """
     vertices, faces, normals = mesh_arrays(surface)
-    colors, most = paint.color_std(to_array(surface.std_m))
+    colors, most = paint.color_std(surface)
     canvas = paint.Canvas()
     canvas.add_mesh(vertices, faces, colors, normals)
     canvas.add_table(vertices, table)

@@ -228,14 +228,13 @@ def _surface(run: Run) -> dict[str, object]:
     """Return the estimated surface with standard deviations and colours, as a dict of arrays made
     by `pack`.
     """
-    std_m = to_array(run.surface.std_m)
     vertices, faces, normals = mesh_arrays(run.surface)
     kept, faces = thin_mesh(vertices, faces)
-    colors, most = color_std(std_m)
+    colors, most = color_std(run.surface)
     ramp = map_colors(np.linspace(0.0, 1.0, VIEWER.ramp), "viridis")
     return {
         **_mesh(vertices[kept], faces, normals[kept]),
-        "std": pack(std_m[kept]),
+        "std": pack(to_array(run.surface.std_m)[kept]),
         "colors": pack(np.round(FULL * colors[kept]), "u1"),
         "most_mm": 1e3 * most,
         "ramp": np.round(FULL * ramp).astype(int).tolist(),
