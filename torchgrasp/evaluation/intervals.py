@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.rules import Seed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,15 +73,15 @@ def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]
 
 
 @checked
-def share_over(counts: Counts, seed: Seed = 0) -> Share:
+def share_over(counts: Counts) -> Share:
     """Return the success rate over all trials, with its 95 % interval from resampling the units.
     `counts` holds (passed, all), the numbers of trials of each unit, by its name.
 
     If all trials passed, or none, resampling gives no width. The interval is then the one-sided 95
     % bound of n independent trials, n being the number of units. Its lower end is 0.05 ** (1 / n)
-    if all passed. Its upper end is 1 minus this if none passed. `seed` draws the resamples.
+    if all passed. Its upper end is 1 minus this if none passed.
     """
-    found = contrast_over([counts], [1.0], seed)
+    found = contrast_over([counts], [1.0])
     if found.units > 1 and found.value in (0.0, 1.0):
         bound = BOOTSTRAP.outside ** (1 / found.units)
         return found._replace(low=bound) if found.value else found._replace(high=1 - bound)
@@ -90,14 +89,14 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 
 
 @checked
-def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: Seed = 0) -> Share:
+def contrast_over(columns: Sequence[Counts], weights: Sequence[float]) -> Share:
     """Return a weighted sum of success rates, with a 95 % interval.
 
     Each of `columns` is for one rate. It holds (passed, all), the numbers of trials of each unit,
     by its name. `weights` are the weights of the rates: 1 and -1 give a difference. All rates use
-    the same resampled units, which `seed` draws. `total` counts the trials of the first column.
-    Resamples in which a column has no trial are left out. An interval of zero width means that the
-    units agree, not that the value is exact.
+    the same resampled units. `total` counts the trials of the first column. Resamples in which a
+    column has no trial are left out. An interval of zero width means that the units agree, not that
+    the value is exact.
     """
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
     total = sum(total for _, total in columns[0].values())
@@ -109,7 +108,7 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
     if len(names) == 1:
         return Share(value, math.nan, math.nan, total, 1)
     shape = (BOOTSTRAP.resamples, len(names))
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     drawn = torch.randint(len(names), shape, generator=generator)
     times = torch.zeros(shape, dtype=torch.float64)
     times.scatter_add_(1, drawn, torch.ones_like(drawn, dtype=torch.float64))
