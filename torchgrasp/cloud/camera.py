@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.pose import Transform, check_rigid
+from torchgrasp.cloud.rays import unproject
 from torchgrasp.cloud.sensor import Image, SensorName, SensorNoise, add_noise, find_sensor
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, MeshError
@@ -183,12 +184,9 @@ def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Imag
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
     mesh = with_true_normals(mesh)
-    row, column = (torch.arange(n).double() for n in (HEIGHT, WIDTH))
-    x = (column - INTRINSICS[0, 2]) / FOCAL
-    y = (row - INTRINSICS[1, 2]) / FOCAL
-    inside = torch.nonzero(_in_image_box(mesh, obj_from_camera, x, y))
-    rays = torch.stack([x[inside[:, 1]], y[inside[:, 0]], torch.ones(len(inside)).double()], -1)
-    direction = rotate(obj_from_camera, rays).numpy()
+    rays = _rays()
+    inside = torch.nonzero(_in_image_box(mesh, obj_from_camera, rays))
+    direction = rotate(obj_from_camera, rays[tuple(inside.T)]).numpy()
     origin = obj_from_camera[:3, 3].numpy()
     face = np.asarray(
         mesh.ray.intersects_first(np.broadcast_to(origin, direction.shape), direction)
@@ -206,31 +204,26 @@ def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Imag
     return images[0], images[1]
 
 
-def _pixels() -> tuple[Image, Image]:
-    """Return the row and the column of each pixel of the default camera."""
-    sides = (torch.arange(n).double() for n in (HEIGHT, WIDTH))
-    row, column = torch.meshgrid(*sides, indexing="ij")
-    return row, column
+def _rays() -> Float[Tensor, "h w 3"]:
+    """Return the rays (x, y, 1) of the default camera's pixels, in its frame."""
+    row = torch.arange(HEIGHT)[:, None]
+    return unproject(torch.ones(HEIGHT, WIDTH).double(), INTRINSICS, row, torch.arange(WIDTH))
 
 
 def _in_image_box(
-    mesh: "trimesh.Trimesh",
-    obj_from_camera: Transform,
-    x: Float[Tensor, "w"],
-    y: Float[Tensor, "h"],
+    mesh: "trimesh.Trimesh", obj_from_camera: Transform, rays: Float[Tensor, "h w 3"]
 ) -> Bool[Tensor, "h w"]:
     """Return a mask of the camera rays (x, y, 1) that pass through the bounding box of the mesh in
-    the image. `x` are those of its columns, and `y` those of its rows.
+    the image.
     """
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)
     if float(depth.min()) <= RENDER.nearest:
-        return torch.ones(len(y), len(x), dtype=torch.bool)
-    u = u / depth
-    v = v / depth
-    wide = (x >= u.min() - RENDER.margin) & (x <= u.max() + RENDER.margin)
-    high = (y >= v.min() - RENDER.margin) & (y <= v.max() + RENDER.margin)
-    return high[:, None] & wide
+        return torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    seen = torch.stack([u, v], -1) / depth[:, None]
+    low = seen.amin(0) - RENDER.margin
+    high = seen.amax(0) + RENDER.margin
+    return ((rays[..., :2] >= low) & (rays[..., :2] <= high)).all(-1)
 
 
 def render_depth(
@@ -270,9 +263,7 @@ def _cast_table(height: float, obj_from_camera: Transform) -> tuple[Image, Image
     """Return the table's depth image [m], and |cosine| between ray and normal; both are 0 where a
     ray misses.
     """
-    row, column = _pixels()
-    rays = torch.stack([column, row, torch.ones_like(row)], -1) @ torch.linalg.inv(INTRINSICS).T
-    direction = rotate(obj_from_camera, rays)
+    direction = rotate(obj_from_camera, _rays())
     origin = obj_from_camera[:3, 3]
     depth = (height - origin[2]) / direction[..., 2]
     where = origin[:2] + depth[..., None] * direction[..., :2]

@@ -133,6 +133,13 @@ class DepthImage(Value):
         camera = unproject(z, k, row, column)
         return apply(self.obj_from_camera.double(), camera.reshape(-1, 3)).reshape(*z.shape, 3)
 
+    def rays(self) -> Float[Tensor, "h w 3"]:
+        """Return the vectors (h, w, 3) from the camera to depth 1, through all pixels, in the frame
+        "obj".
+        """
+        at_one = dataclasses.replace(self, depth=torch.ones_like(self.depth))
+        return at_one.points() - self.obj_from_camera[:3, 3].double()
+
     def at_border(self, pixels: Int[Tensor, "n 2"]) -> bool:
         """Return whether an object reaches the border of the camera's image, in 5 pixels or more.
 

@@ -50,10 +50,7 @@ def _depth_of(table: Plane | None, image: DepthImage) -> Float[Tensor, "h w"]:
     """Return the depth [m] at which each pixel would show the table; 0 where it would not."""
     if table is None:
         return torch.zeros_like(image.depth, dtype=torch.float64)
-    at_one = dataclasses.replace(image, depth=torch.ones_like(image.depth))
-    camera = image.obj_from_camera[:3, 3].double()
-    ways = at_one.points() - camera  # (h, w, 3), of depth 1
-    falls = -(ways @ table.normal.double())
+    falls = -(image.rays() @ table.normal.double())
     meets: Bool[Tensor, "h w"] = falls > 0
-    depth = table.height(camera) / torch.where(meets, falls, 1.0)
+    depth = table.height(image.obj_from_camera[:3, 3].double()) / torch.where(meets, falls, 1.0)
     return torch.where(meets, depth, 0.0)

@@ -180,12 +180,10 @@ def _squares(image: DepthImage, table: Plane) -> Float[np.ndarray, "h w"]:
     """Return for each pixel how well it lies on the lines of a 10 cm grid in the table plane.
     Results are in [0, 1].
     """
-    ones = torch.ones_like(image.depth)
-    flat = DepthImage(ones, image.intrinsics, image.obj_from_camera).points()
     # where the rays of all pixels meet the table: (h, w, 3)
     camera = image.obj_from_camera[:3, 3].double()
     normal = table.normal.double()
-    rays = flat - camera
+    rays = image.rays()
     reach = -table.height(camera) / (rays @ normal).clamp(max=-INKS.least)
     place = camera + reach[..., None] * rays
     across = image.obj_from_camera[:3, 0].double()
