@@ -137,7 +137,7 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
         parts = []
         for shape in link.shapes:
             is_mesh = shape.kind == "mesh"
-            local = meshes[shape.file] * shape.size if is_mesh else _primitive_points(shape)
+            local = meshes[shape.file] * shape.size if is_mesh else _sample(primitive_mesh(shape))
             reach = float(np.abs(local).max())
             called = f"mesh {shape.file!r} that reaches"
             if not reach <= MAX_EXTENT:
@@ -237,13 +237,14 @@ def read_mesh_file(urdf: Urdf, name: str, folder: Path) -> "trimesh.Trimesh":
     return mesh
 
 
-def _primitive_points(shape: LinkShape) -> Points:
+def primitive_mesh(shape: LinkShape) -> "trimesh.Trimesh":
+    """Return the mesh [m] of a box, sphere or cylinder, centred at the origin."""
     if shape.kind == "box":
-        return _sample(trimesh.creation.box(shape.size))
+        return trimesh.creation.box(shape.size)
     if shape.kind == "sphere":
-        return _sample(trimesh.creation.icosphere(FIT.fineness, shape.size[0]))
+        return trimesh.creation.icosphere(FIT.fineness, shape.size[0])
     radius, length = shape.size
-    return _sample(trimesh.creation.cylinder(radius, length, sections=FIT.sections))
+    return trimesh.creation.cylinder(radius, length, sections=FIT.sections)
 
 
 def _sample(mesh: "trimesh.Trimesh") -> Points:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from torchgrasp.app.author.fit_shapes import read_mesh_file
+from torchgrasp.app.author.fit_shapes import primitive_mesh, read_mesh_file
 from torchgrasp.foundation.errors import BadArgument, GraspError
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.limits import HAND_MESH_BYTES, MAX_EXTENT
@@ -125,18 +125,13 @@ def mesh_files(meshes: Mapping[str, Triangles]) -> dict[str, tuple[str, bytes]]:
 
 def _mesh_of(path: Path, data: bytes, shape: LinkShape, folder: Path) -> "trimesh.Trimesh":
     """Return a visual as a mesh in its link's frame; raise `HandFileError` for an unusable one."""
-    if shape.kind == "box":
-        mesh = trimesh.creation.box(shape.size)
-    elif shape.kind == "sphere":
-        mesh = trimesh.creation.icosphere(3, shape.size[0])
-    elif shape.kind == "cylinder":
-        radius, length = shape.size
-        mesh = trimesh.creation.cylinder(radius, length)
-    else:
+    if shape.kind == "mesh":
         urdf = Urdf(path, "", "", (), (), data, b"")
         mesh = read_mesh_file(urdf, shape.file, folder)
         mesh.merge_vertices()
         mesh.apply_scale(shape.size)
+    else:
+        mesh = primitive_mesh(shape)
     mesh.apply_transform(pose_of(shape))
     if not np.isfinite(mesh.vertices).all() or not len(mesh.faces):
         raise BadArgument("urdf", f"{path}: a visual without faces", "a mesh")
