@@ -379,3 +379,15 @@ def test_a_fingertip_over_the_rim_of_a_disc_meets_it():
                 tried += 1
                 assert any(contact.points for contact in system.get_contacts())
     assert tried > 100
+
+
+def test_the_inertia_of_a_body_does_not_depend_on_the_density_of_its_mesh():
+    """trimesh ignores the density of a cylinder in its moment of inertia
+    (findings/trimesh-cylinder-of-water-turns-like-one-of-density-one.sh)."""
+    box = trimesh.creation.box((0.03, 0.04, 0.05))
+    can = trimesh.primitives.Cylinder(radius=0.03, height=0.1)
+    for mesh in (box, can, can.to_mesh()):
+        light = Body(mesh, [mesh], 0.2).inertia
+        mesh.density = 1000.0
+        assert Body(mesh, [mesh], 0.2).inertia == pytest.approx(light, rel=1e-9)
+        assert light.trace() > 1e-5

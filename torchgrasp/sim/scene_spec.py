@@ -98,7 +98,9 @@ class Body:
 
         Its axes are those of the mesh's frame.
         """
-        return np.asarray(self.mesh.moment_inertia) * (self.mass / self.mesh.volume)
+        # scaled by their own mass, as the mesh may have a density
+        weighed = self.mesh.mass_properties
+        return np.asarray(weighed.inertia) * (self.mass / float(weighed.mass))
 
 
 @dataclasses.dataclass(frozen=True)
