@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.files import Malformed, explain, read_bounded
+from torchgrasp.files import Malformed, check_file, explain, read_bounded
 from torchgrasp.files.columns import read_lines
 from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.foundation.lazy import Image
@@ -152,15 +152,16 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
 def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tuple[bytes, str]:
     """Return the bytes and the lower-case suffix of a file.
 
-    Raises `BadArgument`, which calls the argument `name`, for a file with none of the `suffixes`.
-    Raises it also for one that is missing, larger than 512 MiB, or a pointer of Git LFS.
+    Raises `BadArgument`, which calls the argument `name`, for a file that is missing, larger than
+    512 MiB, or a pointer of Git LFS. Raises it also for a file with none of the `suffixes`.
     """
     path = Path(path)
     allowed = f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"
+    refuse = functools.partial(BadArgument, name)
+    check_file(path, CLOUD_BYTES, allowed, refuse)
     suffix = path.suffix.lower()
     if suffix not in suffixes:
-        raise BadArgument(name, path, allowed)
-    refuse = functools.partial(BadArgument, name)
+        raise refuse(path, allowed)
     return read_bounded(path, CLOUD_BYTES, allowed, refuse), suffix
 
 

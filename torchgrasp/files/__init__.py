@@ -10,7 +10,11 @@ from torchgrasp.files.write import (
     plain_value as plain_value,
     read_bytes as read_bytes,
 )
-from torchgrasp.files.write import read_bounded as read_bounded, remove_file as remove_file
+from torchgrasp.files.write import (
+    check_file as check_file,
+    read_bounded as read_bounded,
+    remove_file as remove_file,
+)
 from torchgrasp.files.write import render as render, sha256 as sha256, write_file as write_file
 from torchgrasp.files.write import Malformed as Malformed, explain as explain
 from torchgrasp.files.write import (

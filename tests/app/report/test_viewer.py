@@ -11,10 +11,10 @@ import trimesh
 
 from tests.make import random_motion
 from torchgrasp.app.report.page import format_page
+from torchgrasp.app.report.run_data import VIEW
 from torchgrasp.app.report.solids import EDGE, round_shape, solids_from_hand, solids_of_links
 from torchgrasp.app.report.viewer import (
     POSTURES,
-    VIEW,
     VIEWER,
     describe,
     format_viewer,
