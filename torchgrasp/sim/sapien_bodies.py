@@ -211,7 +211,8 @@ def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
     start = []
     for joint in hand.active_joints:
         joint.set_friction(0.0)
-        # of a position or force, and of a stiffness, damping or rotor
+        # PhysX's units of a position, and of a stiffness, damping or rotor; their product is that
+        # of a force or torque
         unit = CENTIMETRES if joint.type == "prismatic" else 1.0
         square = 1.0 if joint.type == "prismatic" else CENTIMETRES**2
         if joint.name in slides:
