@@ -129,14 +129,8 @@ class SapienScene(SimulatedScene):
             squared = impulse.dot(impulse)
             if squared:
                 size = float(np.sqrt(squared))
-                yield (
-                    size,
-                    [
-                        *(-sign * impulse).tolist(),
-                        *(size / CENTIMETRES * point.position).tolist(),
-                        size,
-                    ],
-                )
+                where = point.position / CENTIMETRES
+                yield size, [*(-sign * impulse).tolist(), *(size * where).tolist(), size]
 
     def step(self) -> StepContacts:
         """Advance by one timestep; return the impulses [N s], forces [N] and places of the hand's
