@@ -22,14 +22,15 @@ from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_househo
 
 from benchmarks.common import Options, Row, bench, format_number, keep, mean_over, run_all
 from benchmarks.scene.scenes import footprint, separation
-from torchgrasp import ContactSpec, GraspTask, Scene, load_hand, plan_scene
+from torchgrasp import ContactSpec, Grasps, GraspTask, Scene, load_hand, plan_scene
+from torchgrasp.cloud.agreement import AGREEMENT, check_contacts
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.evaluation import PROTOCOLS
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.several_tries import lift_grasps
-from torchgrasp.evaluation.trial import GraspTrial, Truth
-from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.evaluation.trial import TRIALS, GraspTrial, Truth
+from torchgrasp.foundation.errors import BadArgument, GraspError, Status
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.planner import ScenePlan
@@ -67,6 +68,8 @@ WAYS = ("mask", "click")
 BARS = {"mask": 0.96, "click": 0.93}
 TRIES = 3
 """Grasps that a robot tries which opens its hand after a failed lift."""
+ELSEWHERE = "ELSEWHERE"
+"""Status of grasps of other things, which the library took for the target."""
 LIMIT = 1800.0
 """Limit [s] of the CPU time of one scene."""
 
@@ -300,23 +303,36 @@ def lift_target(
         return dataclasses.replace(told, said=reasons, clear=len(plan.clear))
     own, *around = map(Neighbour, clutter.meshes, clutter.parts)
     table = Plane.horizontal(0.0)
+    told = dataclasses.replace(told, executable=len(best.grasps), predicted=best.success)
+    if are_elsewhere(best.grasps[:1], own.mesh):
+        return dataclasses.replace(told, status=ELSEWHERE)
     truth = Truth(own.mesh, own.parts, table=table, neighbours=around)
     first = GraspTrial(load_hand(hand), best.grasps[0], truth, seed)
     closed = lift_grasp(first, trial)
     assert closed.disturbance is not None
     held_in_three = closed.held
-    if not held_in_three:
+    if not held_in_three and not are_elsewhere(best.grasps, own.mesh):
         several = dataclasses.replace(first, grasp=best.grasps)
         held_in_three = lift_grasps(several, trial, TRIES)[-1].result.held
     return dataclasses.replace(
         told,
-        executable=len(best.grasps),
-        predicted=best.success,
         status=closed.status.name,
         moved=largest_motion(clutter.meshes[1:], closed.disturbance.neighbour_pose[-1]),
         held_in_three=held_in_three,
         said=best.reason,
     )
+
+
+def are_elsewhere(grasps: Grasps, mesh: trimesh.Trimesh) -> bool:
+    """Return whether most contacts of grasps are off the target's mesh [m], so no trial takes them.
+
+    Then the library took other things for the target, and would grasp one of them.
+    """
+    try:
+        check_contacts(grasps, mesh, TRIALS.slack, AGREEMENT.astray)
+    except BadArgument:
+        return True
+    return False
 
 
 def largest_motion(meshes: Iterable[trimesh.Trimesh], motion: Float[Tensor, "n 4 4"]) -> float:
