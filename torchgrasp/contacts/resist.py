@@ -99,8 +99,21 @@ def share_carried(
 ) -> Float[Tensor, "b"]:
     """Return the share (b,) of a load that each of b contact sets can balance, at most 1.
 
+    Arguments and limits are those of `multiple_carried`.
+    """
+    return multiple_carried(contacts, strength, load, spec).clamp(max=1)
+
+
+def multiple_carried(
+    contacts: Contacts,
+    strength: Float[Tensor, "b f"],
+    load: Float[Tensor, "b 6"],
+    spec: ContactSpec,
+) -> Float[Tensor, "b"]:
+    """Return the greatest multiple (b,) of a load that each of b contact sets can balance.
+
     The contact forces are within the friction cones, and no finger exceeds its `strength`. The
-    share is 0 where none is proven.
+    multiple is 0 where none is proven.
 
     Args:
         contacts: b sets of f contacts [m] with outward unit normals.
@@ -109,7 +122,7 @@ def share_carried(
         spec: its `planned_friction` and `edges` define the friction cones.
     """
     arms = contacts.points - contacts.points.mean(1, keepdim=True)
-    return resist_loads(arms, contacts.normals, strength, load[:, None], spec).margin.clamp(max=1)
+    return resist_loads(arms, contacts.normals, strength, load[:, None], spec).margin
 
 
 def _solve(

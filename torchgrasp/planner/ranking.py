@@ -13,7 +13,7 @@ from torchgrasp.foundation.base import flatnonzero, join
 from torchgrasp.foundation.errors import Status
 from torchgrasp.ik.motion import collision_probability
 from torchgrasp.planner.objects import CloudIndex, Objects
-from torchgrasp.success.features import UNCARRIED, carries_weight, measure_grasps
+from torchgrasp.success.features import lost_by_weakness, measure_grasps, weights_carried
 from torchgrasp.success.loads import strength_of
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.order import (
@@ -78,8 +78,8 @@ def predict(
 
     The second is the share, in [0, 1], of the conditions for which similar grasps were tried. The
     conditions are the distributions of friction and mass; the success is the mean over them. The
-    log-odds fall by 2.1 (`UNCARRIED`) where the fingers cannot carry the mean weight with the mean
-    friction. With obstacles, success also needs that the hand hits none. `cloud` (g,) is the index
+    log-odds fall where the fingers can hardly carry the mean weight with the mean friction
+    (`lost_by_weakness`). With obstacles, success also needs that the hand hits none. `cloud` (g,) is the index
     of each grasp's object.
     """
     task = objects.request.grasp_task
@@ -98,10 +98,10 @@ def predict(
     if task.lifts(spec.plane):
         center = objects.body.rows(cloud).center
         mass = Distribution.of(task.mass).mean
-        carried = carries_weight(
+        carried = weights_carried(
             objects.hand, grasps, center, mass, objects.spec_without_margin, objects.strongest
         )
-        log_odds = log_odds - UNCARRIED * ~carried
+        log_odds = log_odds - lost_by_weakness(carried)
     obstacles = objects.world.obstacles
     if obstacles is not None:
         hit = collision_probability(objects.hand, grasps, obstacles, spec.plane)

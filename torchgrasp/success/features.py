@@ -6,11 +6,11 @@ import dataclasses
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.balance import least_friction_forces
-from torchgrasp.contacts.resist import share_carried
+from torchgrasp.contacts.resist import multiple_carried
 from torchgrasp.foundation.base import spread
 from torchgrasp.geometry.linalg import across, norm, unit
 from torchgrasp.hand.hand import Hand
@@ -78,10 +78,23 @@ class FeatureNumbers:
 
 
 MEASURES = FeatureNumbers()
-UNCARRIED = 2.1
-"""Decrease of a lift's log-odds of success if not even the greatest finger forces carry the weight.
-It is from a logistic regression on the model's log-odds and this, in trials of authored bodies.
-"""
+
+
+@dataclasses.dataclass(frozen=True)
+class WeakNumbers:
+    """By how much the log-odds of a lift fall where the fingers are weak. The numbers are from a
+    logistic regression on the model's log-odds and this, in trials of authored bodies.
+    """
+
+    enough: float = 2.5
+    """Multiple of the weight that the fingers can carry, above which nothing is lost."""
+    least: float = 0.3
+    """Lower bound of this multiple, so that its logarithm is finite."""
+    slope: float = 2.0
+    """Decrease of the log-odds, divided by that of the logarithm of this multiple."""
+
+
+WEAK = WeakNumbers()
 
 
 def measure_grasps(
@@ -175,18 +188,18 @@ def weight_about(
     return torch.cat([force, torch.linalg.cross(arm, force)], -1)
 
 
-def carries_weight(
+def weights_carried(
     hand: Hand,
     grasps: Grasps,
     center: Float[Tensor, "*g 3"],
     mass: float,
     spec: ContactSpec,
     most: float,
-) -> Bool[Tensor, "g"]:
-    """Return a mask of the g grasps whose fingers can carry the weight of a mass.
+) -> Float[Tensor, "g"]:
+    """Return the greatest multiple of the weight of a mass that the fingers of g grasps can carry.
 
-    They can if contact forces exist that balance the weight, within the friction cones. No force
-    may exceed `most`, or what the torques of the drives allow. Linear programming decides this.
+    Contact forces balance the weight, within the friction cones. No force may exceed `most`, or
+    what the torques of the drives allow. Linear programming finds the multiple.
 
     Args:
         hand: the hand of the grasps.
@@ -199,7 +212,16 @@ def carries_weight(
     contacts = grasps.contacts
     strength = strength_of(hand, grasps, contacts, most)
     weight = weight_about(contacts.points, center.to(contacts.points), mass)
-    return share_carried(contacts, strength, weight, spec) >= 1
+    return multiple_carried(contacts, strength, weight, spec)
+
+
+def lost_by_weakness(carried: Float[Tensor, "*g"]) -> Float[Tensor, "*g"]:
+    """Return by how much the log-odds of a lift fall if the fingers carry at most some multiple of
+    the weight, `carried`.
+
+    It is 2 log(2.5 / `carried`), but 0 above 2.5, with the numbers of `WEAK`.
+    """
+    return WEAK.slope * (WEAK.enough / carried.clamp(WEAK.least, WEAK.enough)).log()
 
 
 def _force_for(

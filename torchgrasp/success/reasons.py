@@ -20,9 +20,10 @@ from torchgrasp.success.features import (
     CAUSES,
     FEATURES,
     GRIP,
-    UNCARRIED,
-    carries_weight,
+    WEAK,
+    lost_by_weakness,
     measure_grasps,
+    weights_carried,
 )
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.order import supported_share
@@ -84,8 +85,8 @@ def explain_success(
 
     The log-odds of a probability p are log(p / (1 - p)). Each cause stands for several features,
     the inputs of the success model. Its `log_odds` is by how much the log-odds rise if these
-    features take their median over grasps that held. If no finger forces can carry the weight of a
-    lifted object, the `log_odds` of "load" are greater by 2.1 (`UNCARRIED`). Causes that do not
+    features take their median over grasps that held. If the fingers can hardly carry the weight of a
+    lifted object, the `log_odds` of "load" are greater (`lost_by_weakness`). Causes that do not
     lower the success are left out.
 
     If no trial has tested some of the task's frictions and masses, "task" is always among the
@@ -118,7 +119,7 @@ def explain_success(
     _check_shape(grasps[0], shape)
     stood = stand_upright(grasps[0], hand, shape)
     features = measure_again(*stood, task)
-    carried = _is_carried(*stood, task)
+    carried = _find_carried(*stood, task)
     conditions = conditions_of(grasps, task)
     weights = conditions.weights.to(features)
     supported = supported_share(conditions)
@@ -134,9 +135,9 @@ def explain_success(
         usual[..., columns] = model.usual[columns]
         gain = float(model.mean_log_odds(usual, weights) - known)
         sentence = SENTENCES[cause].format_map(values)
-        if cause == "load" and not carried:
-            gain += UNCARRIED
-            sentence += "; no forces of the fingers carry the weight"
+        if cause == "load":
+            gain += float(lost_by_weakness(carried))
+            sentence += _say_carried(float(carried))
         told.append(Cost(cause, gain, sentence))
     lower = [cost for cost in sorted(told, key=lambda cost: -cost.log_odds) if cost.log_odds > 0]
     if not 0 < supported < 1 - ROUNDING:
@@ -188,17 +189,31 @@ def measure_again(
     return measure_grasps(hand, body, grasps, conditions, task, task.lifts(grasps.table))
 
 
-def _is_carried(hand: Hand, body: EstimatedBody, grasp: Grasps, task: GraspTask) -> bool:
-    """Return whether the fingers of an upright grasp can carry the weight that the task lifts, if
-    any.
+def _find_carried(
+    hand: Hand, body: EstimatedBody, grasp: Grasps, task: GraspTask
+) -> Float[Tensor, ""]:
+    """Return the greatest multiple of the weight that the fingers of an upright grasp can carry.
+
+    It is infinite if the task does not lift.
     """
     lifts = task.lifts(grasp.table)
     if not lifts:
-        return True
+        return torch.tensor(torch.inf)
     spec = ContactSpec(Distribution.parse(grasp.meta["friction"]), friction_margin=1.0)
     mass = Distribution.of(task.mass).mean
     most = task.pressing(lifts) or GRIP
-    return bool(carries_weight(hand, grasp, body.center, mass, spec, most))
+    return weights_carried(hand, grasp, body.center, mass, spec, most)[0]
+
+
+def _say_carried(multiple: float) -> str:
+    """Return the end of a sentence on the load, which says how many times the weight the fingers
+    can carry. It is empty if that is enough.
+    """
+    if multiple < 1:
+        return "; no forces of the fingers carry the weight"
+    if multiple < WEAK.enough:
+        return f"; the fingers carry at most {multiple:.1f} times the weight"
+    return ""
 
 
 def stand_upright(grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[Hand, EstimatedBody, Grasps]:
