@@ -90,7 +90,7 @@ class WeakNumbers:
     """Multiple of the weight that the fingers can carry, above which nothing is lost."""
     least: float = 0.3
     """Lower bound of this multiple, so that its logarithm is finite."""
-    slope: float = 2.0
+    slope: float = 1.4
     """Decrease of the log-odds, divided by that of the logarithm of this multiple."""
 
 
@@ -219,7 +219,7 @@ def lost_by_weakness(carried: Float[Tensor, "*g"]) -> Float[Tensor, "*g"]:
     """Return by how much the log-odds of a lift fall if the fingers carry at most some multiple of
     the weight, `carried`.
 
-    It is 2 log(2.5 / `carried`), but 0 above 2.5, with the numbers of `WEAK`.
+    It is 1.4 log(2.5 / `carried`), but 0 above 2.5, with the numbers of `WEAK`.
     """
     return WEAK.slope * (WEAK.enough / carried.clamp(WEAK.least, WEAK.enough)).log()
 
