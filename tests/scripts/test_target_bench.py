@@ -16,6 +16,7 @@ from benchmarks.scene.target import (
     PIXELS,
     TOUCHING,
     TargetTry,
+    are_elsewhere,
     describe,
     largest_motion,
     make_clutter,
@@ -24,6 +25,8 @@ from benchmarks.scene.target import (
     push_together,
 )
 
+from torchgrasp import load_object
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
 
@@ -93,3 +96,11 @@ def test_a_refused_click_counts_as_asked_and_a_lost_target_does_not():
     assert "0.33 to 0.67: 0 held, 0 without a grasp of 1" in (
         rows["by the share hidden, click"].measured
     )
+
+
+def test_grasps_of_the_target_are_there_and_those_of_its_neighbour_elsewhere():
+    jug = load_object("jug").mesh
+    grasp = load_shipped_grasp("jug", "allegro")
+    assert not are_elsewhere(grasp, jug)
+    beside = rigid(torch.eye(3, dtype=torch.float64), torch.tensor([0.3, 0.0, 0.0]).double())
+    assert are_elsewhere(grasp, moved(jug, beside))
