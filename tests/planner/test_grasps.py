@@ -92,7 +92,11 @@ def test_success_is_what_the_model_says_of_the_features_that_an_explanation_meas
     near(best.interval, load_success_model().interval(odds), 1e-6)
 
 
-@pytest.mark.parametrize("task", [GraspTask(mass=0.02, force=8.0, lift=False), GraspTask(mass=0.9)])
+# a mass that the fingers carry with ease: otherwise the odds would fall by `lost_by_weakness`, too
+LIGHT = GraspTask(mass=0.35)
+
+
+@pytest.mark.parametrize("task", [GraspTask(mass=0.02, force=8.0, lift=False), LIGHT])
 def test_a_task_changes_the_predictions_and_not_the_grasps(task):
     hand = load_hand("barrett")
     shapes = []
