@@ -45,7 +45,9 @@ class FaultNumbers:
     from these surroundings reaches a corner.
     """
     deepest: float = 0.01
-    """Greatest depth [m] of a pixel behind this mean at which it counts as in a corner."""
+    """Greatest depth [m] of a pixel behind the mean depth around it at which it counts as in a
+    corner.
+    """
     beside: int = 3
     """Side [px] of the square about a pixel in which a jump of depth is sought. A pixel with one is
     at the border of the strip that is lost along rims (`SensorNoise.worn`).

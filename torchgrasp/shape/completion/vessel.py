@@ -46,7 +46,7 @@ class VesselNumbers:
     not yet known.
     """
     narrowing: float = 0.8
-    """Factor by which this excess shrinks from round to round."""
+    """Factor by which the excess `wider` shrinks from round to round."""
     on_body: float = 0.002
     """Greatest distance [m] of a point of the body from its wall: twice a camera's noise."""
     thinnest: float = 0.0003
