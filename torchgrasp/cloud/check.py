@@ -46,7 +46,7 @@ class CloudNumbers:
     digit: float = 0.01
     """Step [m] of coordinates that were rounded to two decimals."""
     equal: float = 1e-6
-    """Greatest error of a coordinate that is rounded to two decimals, as a share of the step
+    """Greatest error of a coordinate that counts as rounded to two decimals, as a share of the step
     `digit`.
     """
     coarse: float = 0.002

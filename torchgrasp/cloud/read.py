@@ -62,8 +62,8 @@ class ReadNumbers:
     near_unit: float = 0.05
     """Greatest error of the length of a normal in columns 4 to 6."""
     normals: float = 0.9
-    """Least share of rows at which columns 4 to 6 are normals. Counted are rows in which these have
-    nearly unit length (`near_unit`).
+    """Least share of rows with nearly unit length (`near_unit`) in columns 4 to 6, if these are
+    normals.
     """
     drawn: int = 2000
     """Greatest number of points by which a camera in the origin is judged."""

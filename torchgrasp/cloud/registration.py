@@ -5,9 +5,9 @@ which they agree best. It is the root mean square, over the points, of how far t
 along their normals. So shifts to and from a camera count alike, and turns and scales count. Slides
 that map a surface to itself count nothing. Cameras need not be known. Second, this motion is the
 most likely one, given that poses are known to some mm. What the overlap does not show stays as
-given. `align_views` moves views by the same motion. Usual registration packages do less: they let a
-bottle spin about its axis. Third, what a camera saw through is empty. Points that another view has
-before a surface contradict it, with or without an overlap.
+given. `align_views` moves views by the same motion. The registration packages that we know do less:
+they let a bottle spin about its axis. Third, what a camera saw through is empty. Points that
+another view has before a surface contradict it, with or without an overlap.
 """
 
 import dataclasses

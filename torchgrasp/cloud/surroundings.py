@@ -70,8 +70,8 @@ def find_surroundings(points: Points, normals: Points, table: Plane | None) -> f
 
 
 def tell_strip(points: Points, table: Plane) -> tuple[str, ...]:
-    """Return one note, a sentence, if at least 5 % (`SURROUNDINGS.strip`) of the points of a mask
-    lie on the table beside the object, else none.
+    """Return one note, a sentence, if many points of a mask lie on the table beside the object,
+    else none. Many are at least 5 % (`SURROUNDINGS.strip`).
 
     A mask from a colour image that is not aligned with the depth has such points. `points` (n, 3)
     [m] and the `table` are in one frame.

@@ -157,7 +157,9 @@ def is_along_z(points: Points) -> bool:
 def is_before_origin(points: Points) -> bool:
     """Return whether all points (n, 3) lie before a camera in the origin that looks along z.
 
-    They lie within 50 degrees (`GUESS.half_view`) of z, and farther than twice their extent.
+    All must lie within 50 degrees (`GUESS.half_view`) of z. Their centre must be farther away than
+    2 radii (`GUESS.far`). The radius is the greatest distance of a point from the centre. The
+    points may have any unit.
     """
     return _is_ahead(points, *_enclose(points))
 

@@ -205,10 +205,10 @@ def upright_frame(
     Its z axis is the table's normal. Without a table, z points to the camera; without both, z is
     the direction in which the points spread least. The x axis is horizontal and points towards the
     camera. If the camera is unknown or straight above, x points to the point farthest from the
-    vertical through the points' centroid. The origin is on this vertical, on the table if there is
-    one. `viewpoint` [m] is the camera's position, or several, whose mean is taken. Raises
-    `BadArgument` for a table above a camera, or more than 10 mm (`MOST_ABOVE`) above most points.
-    Raises it also for a table more than 2 m (`MAX_EXTENT`) below the highest point.
+    vertical through the centroid. The origin is on this vertical, on the table if there is one.
+    `viewpoint` [m] is the camera's position, or several, whose mean is taken. Raises `BadArgument`
+    for a table above a camera, or more than 10 mm (`MOST_ABOVE`) above most points. Raises it also
+    for a table more than 2 m (`MAX_EXTENT`) below the highest point.
     """
     points = points.detach().cpu().double()
     centre = points.mean(0)

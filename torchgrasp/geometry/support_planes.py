@@ -87,8 +87,8 @@ class SupportNumbers:
     over: float = 0.5
     """Least share of a target's points that are above the region of its support."""
     plain: float = 0.75
-    """Share of its weight in a support's score that a point loses if it lies on another plane,
-    perhaps a wall.
+    """Share of its weight in a support's score that a point on another plane, perhaps a wall,
+    loses.
     """
     bow: float = 0.010
     """Greatest height [m] of a bowed support above or below the plane that was fitted to a part of

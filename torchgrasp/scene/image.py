@@ -145,7 +145,8 @@ class DepthImage(Value):
         """Return whether an object reaches the border of the camera's image, in 5 pixels or more.
 
         `pixels` holds row and column of each of the object's n pixels. The bound is
-        `IMAGE.border_pixels`. An image that is not `bounded` gives False.
+        `IMAGE.border_pixels`. An image that is not `bounded` gives False. Pixels in the two
+        outermost rows and columns count as at the border.
         """
         last = torch.tensor(self.depth.shape, device=pixels.device) - 1
         reaching = ((pixels <= 1) | (pixels >= last - 1)).any(-1)
@@ -213,8 +214,8 @@ def scale_pixels(count: int, labels: Int[Tensor, "h w"]) -> float:
 def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> Float[Tensor, "k"]:
     """Return the root mean square distance [m] of the points of each label from their mean.
 
-    Entry i of the result is for label i, from 0 to the greatest one; it is 0 for a label without
-    points. `labels` holds the label of each of the h x w `points` [m].
+    Entry i of the result is for label i, from 0 to the greatest one. A label without points gets 0.
+    `labels` holds the label of each of the h x w `points` [m].
     """
     label = labels.reshape(-1)
     own = points.reshape(-1, 3)

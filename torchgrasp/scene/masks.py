@@ -289,12 +289,12 @@ def label_image(
     """Return the label (h, w) of each pixel of a `view`, and notes, a sentence each. `labels`, a
     `mask` or neither may be given, each (h, w).
 
-    Given labels lose pixels on the table and flying pixels. A label is removed as a whole if it is
-    mostly on the table, and keeps under 5 % of its pixels. Without labels the image is segmented. A
-    mask becomes label 1, and loses strips of neighbouring objects, too. Pixels of the mask's object
-    just outside of the mask get label 0. A note names each mask that loses more than a twentieth of
-    its pixels. Raises `BadArgument` for a mask that keeps under 5 % or under 30 of its measured
-    pixels. It is also raised for labels that keep none.
+    Given labels lose pixels on the table and flying pixels. A label that is mostly on the table,
+    and keeps under 5 % of its pixels, is removed. Without labels the image is segmented. A mask
+    becomes label 1, and loses strips of neighbouring objects, too. Pixels of the mask's object just
+    outside of the mask get label 0. A note names each mask that loses more than a twentieth of its
+    pixels. Raises `BadArgument` for a mask that keeps under 5 % or under 30 of its measured pixels.
+    It is also raised for labels that keep none.
     """
     if labels is not None:
         return _trim_labels(view, labels)

@@ -36,8 +36,8 @@ class MergeNumbers:
     gap: float = 0.008
     """Distance [m] between points of two pieces below which the pieces touch."""
     touching: int = 3
-    """Least number of points of a piece that are nearer than `gap` to another one. With fewer, the
-    gap is not known.
+    """Number of a piece's points, the nearest to another piece, of which the farthest gives the
+    gap. With fewer, the gap is not known.
     """
     far: float = 0.05
     """Greatest distance [m] between parts of one object."""

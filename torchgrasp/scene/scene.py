@@ -69,8 +69,8 @@ class SceneNumbers:
     several objects. Hands grasp few objects that are longer.
     """
     filled: float = 0.85
-    """Share of the convex hull of its pixels that a long target (`across`) fills, below which it
-    may be several objects.
+    """Share of the convex hull of its pixels that a long target (`across`) fills. With less, it may
+    be several objects.
     """
     closing: int = 2
     """Number of pixels by which gaps in a target are closed before the share `filled` is measured.

@@ -159,12 +159,11 @@ def _risen(view: TableImage) -> Bool[Tensor, "h w"]:
 
 
 def above_table_not_flying(view: TableImage) -> Bool[Tensor, "h w"]:
-    """Return a mask of the pixels above the table, without flying pixels: those beside at most one
-    jump of depth.
+    """Return a mask of the pixels above the table that are not flying pixels.
 
     A flying pixel lies between a nearer and a farther surface. So the depth jumps back beside it on
     one side, and forward on another. The pixels of a thin bar are beside jumps back only. They are
-    in this mask, but not in that of `rests_on`.
+    in the result, but not in the mask of `rests_on`.
     """
     before_jump, behind_jump = _jumps(view.smooth)
     return _risen(view) & ~(before_jump & behind_jump)

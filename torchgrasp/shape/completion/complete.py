@@ -113,9 +113,9 @@ class BarNumbers:
 
 BAR = BarNumbers()
 Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "whole"]
-"""How the hidden side was estimated: from an ellipsoid ("ball"), an axis ("revolution"), mirror
-planes, the walls of a vessel, or only the outline ("guess"). "cut off" means not at all, because
-the image border cuts the object off. "whole" means that there is no hidden side.
+"""How the hidden side was estimated: by an ellipsoid, an axis, mirror planes, or the walls of a
+vessel. "guess" means from the outline alone. It was not estimated if the image border cuts the
+object off. A "whole" cloud has no hidden side.
 """
 SomeHidden = TypeVar("SomeHidden", bound=Any)  # a batch with `points` [m]
 

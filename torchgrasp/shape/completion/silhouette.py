@@ -58,7 +58,7 @@ class OutlineNumbers:
     taken.
     """
     least_slope: float = 1e-12
-    """Least length of the slope of the distance from the outline that is a divisor (no unit)."""
+    """Least length (no unit) of the slope of the distance from the outline that is a divisor."""
     rim: int = 16
     """Greatest number of points that are taken on the outline."""
     rim_neighbours: int = 4

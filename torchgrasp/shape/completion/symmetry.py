@@ -277,8 +277,9 @@ def find_planes(
     On a table, the search tries only vertical planes. A plane perpendicular to the best one is
     added if none was found near it. Its mirror images are hidden, so that the cloud cannot confirm
     it. A horizontal plane at half the height is added to give the underside. A body of revolution
-    (`turned`) gets neither, because every plane through its axis matches. If it has no table, a
-    plane that mirrors its ends may be added. If there are no planes, p is 0.
+    (`turned`) gets neither, because every plane through its axis matches. Without a table, a plane
+    that mirrors the ends of such a body may be added. For such a body, and without a table, a plane
+    that faces the cameras may be added, too. If no plane is found, p is 0.
     """
     views = [unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]
     view = torch.stack(views).mean(0)

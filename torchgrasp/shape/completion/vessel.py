@@ -282,7 +282,9 @@ def complete_walls(
 
 
 def lid(vessel: Vessel) -> HiddenWall:
-    """Return 7 points on an imagined flat lid that closes a vessel's outer surface at its rim."""
+    """Return 7 points on an imagined flat lid that closes a vessel's outer surface at its rim. They
+    are in the frame of the vessel.
+    """
     return _disc(vessel, vessel.rim, vessel.radius, WALL.lid_rings)
 
 
