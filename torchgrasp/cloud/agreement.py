@@ -27,7 +27,7 @@ class AgreementNumbers:
     drawn: int = 300
     """Greatest number of points whose distances from a mesh or a cloud are measured."""
     drawn_of_cloud: int = 500
-    """Greatest number of points of a cloud to which these distances are measured."""
+    """Greatest number of points of a cloud to which the distances of other points are measured."""
     slack: float = 0.01
     """Greatest distance [m] of points from their mesh, in addition to the noise. Points farther
     away count as off the mesh.
@@ -54,7 +54,9 @@ class AgreementNumbers:
     unseen: float = 0.03
     """Greatest distance [m] of contacts from a partial cloud and the space hidden behind it."""
     unseen_share: float = 0.5
-    """Greatest share of contacts that may be farther from the cloud and this space."""
+    """Greatest share of contacts that may be farther than `unseen` from the cloud and the space
+    hidden behind it.
+    """
     lowest: float = 0.02
     """Share of the points of an object that may be lower than its foot: outliers."""
     foot: float = 0.015

@@ -46,7 +46,9 @@ class CloudNumbers:
     digit: float = 0.01
     """Step [m] of coordinates that were rounded to two decimals."""
     equal: float = 1e-6
-    """Greatest error of a coordinate that is rounded to such a step, as a share of the step."""
+    """Greatest error of a coordinate that counts as rounded to two decimals, as a share of the step
+    `digit`.
+    """
     coarse: float = 0.002
     """Least step [m] of coordinates for a warning: its rounding errors are as large as a camera's
     noise.

@@ -29,11 +29,13 @@ ATTRIBUTES = (
 )
 """Names of the attributes of an object that describes a camera."""
 COUNTS = ("factor_depth", "depth_factor", "png_depth_scale", "depthmapfactor")
-"""Names of the counts of a metre: of GraspNet, NICE-SLAM and ORB-SLAM."""
+"""Names under which files state how many counts of the depth are a metre: of GraspNet, NICE-SLAM
+and ORB-SLAM.
+"""
 SIDES = ("x_offset", "y_offset", "width", "height")
-"""Names of the numbers of ROS's region of interest."""
+"""Names of the four numbers of ROS's region of interest [px]."""
 SCALES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4)
-"""Ratios of two resolutions of one camera."""
+"""Ratios of two resolutions of one camera that are usual."""
 MODES = (
     *((320, 240), (424, 240), (480, 270), (512, 424), (640, 360), (640, 480), (640, 576)),
     *((848, 480), (960, 540), (960, 720), (1024, 768), (1280, 720), (1280, 960)),

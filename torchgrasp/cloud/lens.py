@@ -26,9 +26,9 @@ OpenCV's examples, Kalibr and Bouguet's toolbox.
 """
 OFF_CENTRE = ("codx", "cody")  # Azure Kinect's centre of distortion, 0 in its devices
 MODELS = ("distortion_model", "model", "model_type", "modeltype", "camera_model")
-"""Names of the model's name."""
+"""Names under which drivers state which distortion model is used."""
 LIKE = "distortion"
-"""Part of the names of other coefficients, such as MATLAB's RadialDistortion."""
+"""Text that the names of other coefficients contain, such as MATLAB's RadialDistortion."""
 POLYNOMIAL = (
     *("plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole", ""),
     "calibration_lensdistortionmodelbrownconrady",

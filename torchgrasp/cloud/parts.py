@@ -188,10 +188,10 @@ def find_ground(
 ) -> SupportPlane | None:
     """Return the plane on which objects stand, found among `points`; None if there is none.
 
-    A nearly level plane at least `level_width` [m] wide is sought first. If there is none, any
-    plane counts on whose upper side the cameras are. All are in one frame. The points (n, 3) are in
-    metres. `eye` holds the camera's position [m], or that of each point; None if it is unknown.
-    `up` is the unit vector that points up.
+    A nearly level plane at least `level_width` [m] wide is sought first. If there is none, and the
+    cameras are known, any plane counts on whose upper side they are. All are in one frame. The
+    points (n, 3) are in metres. `eye` holds the camera's position [m], or that of each point; None
+    if it is unknown. `up` is the unit vector that points up.
     """
     middle = None if eye is None else eye.reshape(-1, 3).mean(0)
     kinds = (

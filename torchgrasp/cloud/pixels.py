@@ -40,8 +40,8 @@ class PixelNumbers:
     usual: float = 0.6
     """Usual distance [m] of a camera, at which the search begins."""
     rare: float = 0.5
-    """Share by which the irregularity counts as greater at e times this distance, or 1 / e. Small
-    things hardly show how far the camera is.
+    """Share by which the irregularity counts as greater at e or 1 / e times the distance `usual`.
+    Small things hardly show how far the camera is.
     """
     starts: int = 2
     """Number of the best directions that are refined together."""

@@ -34,10 +34,12 @@ FIXES = {
     (4 * 4,): "reshape it to 4 x 4",
     (7,): "make a matrix of the quaternion",
 }
-"""What makes a pose of other shapes."""
+"""How to make a 4 x 4 pose of an array with another shape, by its shape."""
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
 OPTICAL = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).double()
-"""From the axes of OpenGL's camera to ours, and from ours to those of ROS's camera_link."""
+"""Rotation (3, 3) from a camera's axes (x right, y down, z forward) to those of ROS's camera_link.
+`FLIP` leads to them from the axes of OpenGL's camera.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +67,7 @@ class PoseNumbers:
     shallow: float = 0.15
     """Least median depth [m] of a view in which a table should have been found."""
     deep: float = 4.0
-    """Greatest median depth [m] of such a view."""
+    """Greatest median depth [m] of a view in which a table should have been found."""
     roll: float = 20.0
     """Least roll [deg] of a camera whose inverse pose is suggested if it has none. Cameras roll by
     less, hang upside down, or lie on their side.

@@ -393,8 +393,8 @@ def merge_clouds(
     makes the density even.
 
     Two different views from one place raise a `CloudWarning`: perhaps one pose was given twice.
-    Another one tells the views whose camera is unknown. It is estimated from their points, and
-    counts as given in the result.
+    Another `CloudWarning` names the views that have neither normals nor camera. Their camera is
+    estimated from their points, and counts as given in the result.
 
     Overlapping views are compared. If they are farther apart than noise explains, `MendedInput`
     warns. Their distance becomes the result's `pose_error` [m], which widens the standard

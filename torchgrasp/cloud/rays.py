@@ -15,7 +15,9 @@ from torchgrasp.geometry.linalg import Points, unit
 
 @dataclasses.dataclass(frozen=True)
 class RayNumbers:
-    """Parameters of the test whether depths are distances from the camera along its rays."""
+    """Parameters of the test whether depths are distances from the camera along its rays, or
+    inverse depths.
+    """
 
     near: float = 0.005
     """Greatest distance [m] from a plane of points that count as on it."""
@@ -29,7 +31,8 @@ class RayNumbers:
     """Number of fits, each to the points near the plane of the fit before."""
     better: float = 1.3
     """Least ratio of two shares of points on one plane, at which a note is given. The first share
-    is that with the depths read as distances, the second that with the depths as they are.
+    is that with the depths read as distances or inverse depths. The second is that with the depths
+    as they are.
     """
 
 

@@ -62,21 +62,25 @@ class ReadNumbers:
     near_unit: float = 0.05
     """Greatest error of the length of a normal in columns 4 to 6."""
     normals: float = 0.9
-    """Least share of rows with such a length at which columns 4 to 6 are normals."""
+    """Least share of rows with nearly unit length (`near_unit`) in columns 4 to 6, if these are
+    normals.
+    """
     drawn: int = 2000
     """Greatest number of points by which a camera in the origin is judged."""
     searched: int = 1000
     """Number of rows, about, among which a point that stands for missing pixels is sought."""
     fewest: int = 100
-    """Least number of rows that can have such a point."""
+    """Least number of rows among which a point that stands for missing pixels is found."""
     repeated: float = 0.05
-    """Least share of these rows that hold such a point."""
+    """Least share of the searched rows that hold a point that stands for missing pixels."""
     usual: float = 0.9
     """Quantile of the numbers of equal rows that counts as the usual number, as clouds may hold
     copies of points.
     """
     more: float = 5.0
-    """Least number of rows with such a point, as a multiple of the usual number of equal rows."""
+    """Least number of rows with a point that stands for missing pixels. It is a multiple of the
+    usual number of equal rows.
+    """
 
 
 READ = ReadNumbers()

@@ -52,14 +52,13 @@ class DepthShot(NamedTuple):
 
 
 def shoot_depth(serial: str | None = None, numbers: LiveCameraNumbers = SHOT) -> DepthShot:
-    """Return the median of 9 depth frames (`SHOT.frames`) of a connected RealSense, which stands
-    still.
+    """Return the median of 9 depth frames (`SHOT.frames`) of a connected RealSense.
 
-    The resolution is the camera's default. `serial` is the camera's serial number; None means the
-    only camera. `numbers` count the frames and bound the waits. Raises `MissingExtra` without the
-    package pyrealsense2. Raises `BadArgument` if this package cannot be loaded, or if not exactly
-    one camera fits. It is raised, too, if the camera does not start, a frame does not come, or the
-    view moves.
+    Camera and scene must stand still meanwhile. The resolution is the camera's default. `serial` is
+    the camera's serial number; None means the only camera. `numbers` count the frames and bound the
+    waits. Raises `MissingExtra` without the package pyrealsense2. Raises `BadArgument` if this
+    package cannot be loaded, or if not exactly one camera fits. It is raised, too, if the camera
+    does not start, a frame does not come, or the view moves.
     """
     sdk = import_sdk()
     device = _choose(sdk, list_cameras(sdk), serial)

@@ -3,11 +3,11 @@
 Three decisions matter. First, the distance of two views is that of a motion: the rigid one after
 which they agree best. It is the root mean square, over the points, of how far the motion moves them
 along their normals. So shifts to and from a camera count alike, and turns and scales count. Slides
-along a surface that do not change it count nothing. Cameras need not be known. Second, this motion
-is a most likely one. What the overlap does not show stays as given, since the poses are known to
-some mm. Registration with `align` is the same motion, so a package for it would do less. The
-packages that we know let a bottle spin about its axis. Third, what a camera saw through is empty.
-Points that another view has before a surface contradict it, with or without an overlap.
+that map a surface to itself count nothing. Cameras need not be known. Second, this motion is the
+most likely one, given that poses are known to some mm. What the overlap does not show stays as
+given. `align_views` moves views by the same motion. The registration packages that we know do less:
+they let a bottle spin about its axis. Third, what a camera saw through is empty. Points that
+another view has before a surface contradict it, with or without an overlap.
 """
 
 import dataclasses
@@ -38,7 +38,9 @@ class ViewDistanceNumbers:
     drawn: int = 400
     """Greatest number of points of a view that are compared with another view."""
     surface: int = 5000
-    """Greatest number of points of the other view's surface with which they are compared."""
+    """Greatest number of points of the other view's surface with which the points of a view are
+    compared.
+    """
     reach: float = 1.5
     """Greatest distance of compared points of two views along the surface, in spacings of the
     surface's points.
@@ -90,7 +92,7 @@ class RegistrationNumbers:
     first: float = 0.04
     """Greatest distance [m] of matching points in the first step."""
     shrink: float = 0.8
-    """Factor by which this distance shrinks from step to step."""
+    """Factor by which the greatest distance of matching points shrinks from step to step."""
     last: float = 4.0
     """Greatest distance of matching points in the last steps, in multiples of the noise."""
     steps: int = 25

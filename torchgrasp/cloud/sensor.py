@@ -45,7 +45,9 @@ class FaultNumbers:
     from these surroundings reaches a corner.
     """
     deepest: float = 0.01
-    """Greatest depth [m] of a pixel behind this mean at which it counts as in a corner."""
+    """Greatest depth [m] of a pixel behind the mean depth around it at which it counts as in a
+    corner.
+    """
     beside: int = 3
     """Side [px] of the square about a pixel in which a jump of depth is sought. A pixel with one is
     at the border of the strip that is lost along rims (`SensorNoise.worn`).
@@ -255,8 +257,8 @@ SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType(
 def find_sensor(noise: bool | SensorName | SensorNoise) -> SensorNoise | None:
     """Return the model of a camera's noise, by the camera's name; None for no noise.
 
-    Names are "realsense", "realsense_cloud", "kinect_v1", "azure" and "zivid". True means the noise
-    of an active stereo camera, False no noise; a model is returned itself.
+    `noise` is a name: "realsense", "realsense_cloud", "kinect_v1", "azure" or "zivid". True means
+    the noise of an active stereo camera, and False no noise. A model is returned itself.
     """
     if isinstance(noise, bool):
         return ACTIVE_STEREO if noise else None
@@ -364,9 +366,9 @@ def estimate_noise(
     """Return a model of a camera's noise, estimated from a depth image of a table.
 
     It is None if fewer than 1000 pixels show the table. The fields `floor` [m] and `growth` [1/m]
-    are its random part (`fit_noise`). `bias` [m] is its smooth part. The depth (h, w) is in metres,
-    the intrinsics are in pixels, and the plane is in the camera's frame. Of the pixels `on_table`,
-    those over 20 mm from the plane do not count.
+    are its random part (`fit_noise`). `bias` [m] and `bias_width` [px] describe its smooth part.
+    The depth (h, w) is in metres, the intrinsics are in pixels, and the plane is in the camera's
+    frame. Of the pixels `on_table`, those over 20 mm from the plane do not count.
     """
     row, column = (torch.arange(n, dtype=torch.float64) for n in depth.shape)
     x = (column - intrinsics[0, 2]) / intrinsics[0, 0]

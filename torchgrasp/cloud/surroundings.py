@@ -21,19 +21,22 @@ class SurroundingNumbers:
     risen: float = 0.015
     """Least height [m] above the table of points that count as the object's."""
     fewest: int = 20
-    """Least number of these points, and least number of points on the table."""
+    """Least number of the object's points (`risen`), and least number of points on the table."""
     beyond: float = 0.02
     """Distance [m] from the object's outline, seen from above, beyond which points on the table
     count. A foot is hardly wider than the rest.
     """
     share: float = 0.1
-    """Least share of all points that are on the table and so far from the outline."""
+    """Least share of all points that are on the table and farther than `beyond` from the outline.
+    """
     beside: float = 0.01
     """Distance [m] from the outline beyond which points of a mask on the table are told. Borders of
     masks err by less.
     """
     strip: float = 0.05
-    """Least share of all points of the mask that are on the table and so far from the outline."""
+    """Least share of all points of the mask that are on the table and farther than `beside` from
+    the outline.
+    """
     sectors: int = 12
     """Number of equal sectors around the object, seen from above."""
     sides: float = 0.55
@@ -43,9 +46,11 @@ class SurroundingNumbers:
     planes: int = 64
     """Number of planes, each through one point, that are tried where the table is unknown."""
     fits: int = 3
-    """Number of fits of the best of these planes, each to the points near it."""
+    """Number of fits of the best of the tried planes (`planes`), each to the points near it."""
     below: float = 0.02
-    """Greatest share of points clearly below such a plane: below a table nothing is seen."""
+    """Greatest share of points clearly below a tried plane (`planes`): below a table nothing is
+    seen.
+    """
 
 
 SURROUNDINGS = SurroundingNumbers()
@@ -65,8 +70,8 @@ def find_surroundings(points: Points, normals: Points, table: Plane | None) -> f
 
 
 def tell_strip(points: Points, table: Plane) -> tuple[str, ...]:
-    """Return one note, a sentence, if 5 % (`SURROUNDINGS.strip`) of the points of a mask lie on the
-    table beside the object, else none.
+    """Return one note, a sentence, if many points of a mask lie on the table beside the object,
+    else none. Many are at least 5 % (`SURROUNDINGS.strip`).
 
     A mask from a colour image that is not aligned with the depth has such points. `points` (n, 3)
     [m] and the `table` are in one frame.

@@ -62,7 +62,9 @@ class GuessNumbers:
     directions: int = 400
     """Number of directions of the camera that are tried; they are about 10 degrees apart."""
     above: float = 0.1
-    """Least cosine between such a direction and the vertical, as a camera is above the support."""
+    """Least cosine between the direction of a camera and the vertical, as a camera is above the
+    support.
+    """
     distance: float = 4.0
     """Distance of a guessed camera from the centre of the cloud, in radii of the cloud."""
     density: float = 3.0
@@ -100,8 +102,8 @@ def guess_viewpoint(
     """Return an estimated camera position (3,) [m] of a view, and the angle [deg] of its
     uncertainty.
 
-    The camera's direction is likely within this angle of the estimate; 180 degrees means that the
-    points hardly show the direction.
+    The position is in the frame of the points. The camera's direction from their centre is likely
+    within the angle of the estimate. 180 degrees means that the points hardly show the direction.
 
     First the origin is tried. It is returned if the points lie before it along z, and a camera
     there can have seen them. If `up` is known, the points must also lie below the origin. Else the
@@ -155,7 +157,9 @@ def is_along_z(points: Points) -> bool:
 def is_before_origin(points: Points) -> bool:
     """Return whether all points (n, 3) lie before a camera in the origin that looks along z.
 
-    They lie within 50 degrees (`GUESS.half_view`) of z, and farther than twice their extent.
+    All must lie within 50 degrees (`GUESS.half_view`) of z. Their centre must be farther away than
+    2 radii (`GUESS.far`). The radius is the greatest distance of a point from the centre. The
+    points may have any unit.
     """
     return _is_ahead(points, *_enclose(points))
 

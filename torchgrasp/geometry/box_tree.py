@@ -12,7 +12,7 @@ class Boxes(NamedTuple):
     """A balanced tree of boxes around points of any unit, in which nearest points are sought.
 
     Box 1 is the root, and box i holds boxes 2 i and 2 i + 1. There is no box 0. The last l boxes
-    are leaves, which hold s points each.
+    are leaves, which hold s points each, the last one filled up with NaN.
     """
 
     low: np.ndarray  # least coordinates (2 l, 3) of the points in a box

@@ -1,5 +1,5 @@
-"""Distance fields of several objects in one value, which finds the distances of points to their own
-objects at once.
+"""Distance fields of several objects in one value. It finds the distances of many points at once,
+each from the object of the point.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ from torchgrasp.geometry.signed_distance import (
 
 @dataclasses.dataclass(frozen=True)
 class FieldBatch(DistanceField):
-    """The distance fields of c objects, joined, so that a batch of points can have a field for each
-    entry.
+    """The joined distance fields of c objects: each entry of a batch of points can have its own
+    field.
 
     The batch has r entries. Points given to a method have the shape (r, ..., 3). The points of
     entry i belong to the field with the index `owner[i]`. They are in the frame of its object. Each

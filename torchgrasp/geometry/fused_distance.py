@@ -1,6 +1,6 @@
 """Distances of points from a triangle mesh as one compiled loop over points.
 
-`MeshSurface.distance` defines them, by a search tree and with arrays.
+`MeshSurface.distance` computes the same with a search tree and arrays.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
 """Distances interpolated in a grid, as compiled loops.
 
 A grid has the fields `values` (n,) [m] of its nodes, `origin` (3,) [m], `shape` (3,) and `spacing`
-[m]. `DistanceField.query` defines what is found.
+[m]. The results are those of `DistanceField.query`.
 """
 
 import math
@@ -18,7 +18,8 @@ from torchgrasp.geometry.fused_vectors import dot, put, scale
 class LookedUp(NamedTuple):
     """A grid of signed distances, negative inside an object, as NumPy arrays for compiled loops.
 
-    The function `query` interpolates between its nodes, of which there are n.
+    It has n nodes, between which the function `query` interpolates. Lengths are in metres, in the
+    frame of the object.
     """
 
     values: np.ndarray  # signed distances (n,) [m] at the nodes, those along z adjacent

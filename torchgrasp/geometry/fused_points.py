@@ -23,8 +23,9 @@ def nearest(points: np.ndarray, boxes: Boxes, limit: float) -> tuple[np.ndarray,
 def farthest(points: np.ndarray, count: int, first: int, tie: float) -> np.ndarray:
     """Return the indices of `count` of n points (n, d), each the farthest from all those before it.
 
-    The choice begins with the point of the index `first`. Points whose squared distances differ by
-    at most the share `tie` count as equally far. The first of them is taken.
+    The choice begins with the point of the index `first`. Points count as equally far if their
+    squared distance is at least (1 - `tie`) times the greatest one. The first of them is taken.
+    `tie` has no unit.
     """
     picks = np.full(count, first)
     _put_farthest(np.ascontiguousarray(points), tie, picks)

@@ -216,11 +216,11 @@ def farthest_points(
     """Return the indices of `count` points, or of all if fewer, each the farthest from those before
     it.
 
-    The choice begins with the point of the index `first`. Points whose distances differ by at most
-    the share `tie` count as equally far; the first of them is taken. Points in `before` count as
-    already chosen and are not returned; with any of them, `first` is not used. `distance(points,
-    one)` returns the distances (n,) of all points to one; None means the squared Euclidean
-    distance.
+    The choice begins with the point of the index `first`. Points count as equally far if their
+    distance is at least (1 - `tie`) times the greatest one. The first of them is taken. Points in
+    `before` count as already chosen and are not returned; with any of them, `first` is not used.
+    `distance(points, one)` returns the distances (n,) of all points to one; None means the squared
+    Euclidean distance.
     """
     every = points.detach().cpu()
     if distance is None and before is None and is_fused(every) and len(every):

@@ -1,5 +1,5 @@
-"""Exact signed distances to a triangle mesh, which may be open. Samples of the surface propose a
-few triangles; the distance is that to the nearest of them.
+"""Signed distances to a triangle mesh, which may be open. Samples of the surface propose a few
+triangles near a point. The distance is exactly that from the nearest of these triangles.
 """
 
 import dataclasses

@@ -210,9 +210,9 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         on.
 
         `model` holds the residuals and their Jacobian, and `damping` (a,) the damping of each
-        problem's step. A step whose largest change of a variable exceeds `largest` is shortened to
-        it. The step of a problem with a singular matrix is zero. A problem ends if its cost is
-        below `solved`, or its damping is infinite.
+        problem's step. A step whose largest change of a variable exceeds `largest` is shortened, so
+        that this change is `largest`. The step of a problem with a singular matrix is zero. A
+        problem ends if its cost is below `solved`, or its damping is infinite.
         """
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
@@ -238,9 +238,10 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         """Return a mask (a,) of the accepted steps, which lower the cost, and the damping (a,) of
         the next ones.
 
-        An accepted step divides the damping by `fall`, a rejected one multiplies it by `rise`. An
-        infinite damping ends a problem. So ends a problem whose accepted step lowers the cost by
-        less than the share `stalled`. So does one whose step is rejected at a damping above `lost`.
+        An accepted step divides the damping by `fall`, a rejected one multiplies it by `rise`. The
+        result is kept between `least` and `most`. An infinite damping ends a problem. It is
+        returned if an accepted step lowers the cost by less than the fraction `stalled`. It is also
+        returned if a step is rejected at a damping above `lost`.
 
         Args:
             model: residuals and costs of the problems before the steps.

@@ -25,8 +25,8 @@ FINE = GRID**1.5  # step of rounded numbers (no unit) of about size 1: a billion
 POINTS = ("points", "viewpoint", "vertices")
 DIRECTIONS = ("normals", "approach", "witness", "frustum", "task_load", "task_twist", "task_forces")
 POSES = ("obj_from_hand", "obj_from_vf")
-"""Names of the fields that change with the coordinate frame, by kind; all other fields are
-invariant.
+"""Names of the fields that hold poses (4, 4), which a change of the coordinate frame transforms.
+`POINTS` names those of points, `DIRECTIONS` those of directions; all other fields are invariant.
 """
 # least sine of the camera's angle to the vertical at which its horizontal direction is used
 LEAST_TILT = 0.05
@@ -204,11 +204,11 @@ def upright_frame(
     All arguments and the pose are in one frame `obj`. The upright frame moves with the arguments.
     Its z axis is the table's normal. Without a table, z points to the camera; without both, z is
     the direction in which the points spread least. The x axis is horizontal and points towards the
-    camera. If the camera is straight above, x points to the point farthest from the vertical
-    through the points' centroid. The origin is on this vertical, on the table if there is one.
+    camera. If the camera is unknown or straight above, x points to the point farthest from the
+    vertical through the centroid. The origin is on this vertical, on the table if there is one.
     `viewpoint` [m] is the camera's position, or several, whose mean is taken. Raises `BadArgument`
     for a table above a camera, or more than 10 mm (`MOST_ABOVE`) above most points. Raises it also
-    for one more than 2 m (`MAX_EXTENT`) below the highest point.
+    for a table more than 2 m (`MAX_EXTENT`) below the highest point.
     """
     points = points.detach().cpu().double()
     centre = points.mean(0)

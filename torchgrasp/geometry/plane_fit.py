@@ -42,7 +42,9 @@ class PlaneNumbers:
     at_once: int = 500
     """Number of proposed planes that are scored at once, which bounds the memory."""
     least_share: float = 0.05
-    """Least share of the points of a view that lie on a plane."""
+    """Least share of a view's points on two parallel levels. The search for planes ends at half
+    this share.
+    """
     most_tilt: float = 30.0
     """Greatest angle [deg] between the normal of a plane and the upward direction, if that is
     known.
@@ -154,8 +156,8 @@ class SeenPoints:
 class PlaneFit:
     """A plane normal . p = offset, fitted to many points p [m] of a view.
 
-    It is in the frame of the view. Noise is the standard deviation of the points' distances from
-    the plane.
+    It is in the frame of the view. `scale` is the ratio of the measured to the assumed noise of the
+    `count` points on it. Noise is the standard deviation [m] of their distances from the plane.
     """
 
     normal: Float[Tensor, "3"]  # unit normal (3,)
@@ -187,8 +189,9 @@ def fit_planes(view: SeenPoints, generator: torch.Generator) -> Iterator[PlaneFi
     """Yield planes in a view, each the one with most of the points that no earlier plane holds.
 
     At most 8 planes (`PLANES.planes`) are sought. One that goes aslant through two parallel levels
-    is replaced by both. The search ends when no plane holds 2.5 % of the points. `generator` draws
-    the triples of points that propose planes.
+    is replaced by both. The search ends when every further plane holds less than 2.5 % of all
+    points (half of `PLANES.least_share`). Points on earlier planes do not count. There may be no
+    plane. `generator` draws the triples of points that propose planes.
     """
     points = view.points[: PLANES.scored]
     noise = view.noise[: PLANES.scored]

@@ -29,9 +29,11 @@ class SupportNumbers:
     at_once: int = 10_000
     """Number of points that are compared with a region at once, which bounds the memory."""
     thickness: float = 4.0
-    """Greatest distance of a point that counts as on a support, in multiples of its noise."""
+    """Greatest distance of a point that counts as on a support, in multiples of the point's noise.
+    """
     least_thickness: float = 0.001
-    """Distance [m] that is added to the noise: a table is not quite flat."""
+    """Distance [m] that is added to the noise: a table is not quite flat.
+    """
     most_through: float = 0.1
     """Greatest number of points that the camera sees below a support, through its region. It is a
     share of the points on it.
@@ -55,13 +57,15 @@ class SupportNumbers:
     camera cannot see this plane from above. A wall faces a camera that looks down so.
     """
     upside_down: float = 0.25
-    """Factor on the score of such a plane: few cameras are upside down."""
+    """Factor on the score of a plane that an upright camera cannot see from above (`downward`). Few
+    cameras are upside down.
+    """
     plausible: float = 0.2
     """Least score of a support at an angle to the best one, over the best: a wall has less."""
     margin: float = 0.1
     """Distance [m] beside a bowed support at which its surface may not go on at another height."""
     most_away: float = 0.5
-    """Greatest number of points within this margin that are near the plane but not on it. It is a
+    """Greatest number of points within the `margin` that are near the plane but not on it. It is a
     share of the points on the support.
     """
     near: float = 0.08
@@ -83,7 +87,8 @@ class SupportNumbers:
     over: float = 0.5
     """Least share of a target's points that are above the region of its support."""
     plain: float = 0.75
-    """Share of its score that a point low above a support loses on another plane, perhaps a wall.
+    """Share of its weight in a support's score that a point on another plane, perhaps a wall,
+    loses.
     """
     bow: float = 0.010
     """Greatest height [m] of a bowed support above or below the plane that was fitted to a part of
@@ -180,7 +185,8 @@ class SupportPlane:
         region.
 
         Straight means along the plane's normal. Points at most `margin` [m] beside the region
-        count, too; a negative margin shrinks it. Here b stands for any batch axes.
+        count, too; a negative margin shrinks the region. An unbounded region covers all points.
+        Here b stands for any batch axes.
         """
         if self.sides is None:
             return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)

@@ -97,7 +97,7 @@ class DepthImage(Value):
 
     @property
     def frustum(self) -> Float[Tensor, "4 3"] | None:
-        """Inward unit normals of the four sides of the camera's view: left, right, top, bottom.
+        """Inward unit normals (4, 3) of the sides of the camera's view: left, right, top, bottom.
 
         They are in the frame "obj" to which the pose leads; None if the image has no border.
         """
@@ -122,7 +122,8 @@ class DepthImage(Value):
         return dataclasses.replace(self, obj_from_camera=torch.round(pose / FINE) * FINE)
 
     def points(self) -> Float[Tensor, "h w 3"]:
-        """Return the point [m] of every pixel, in the frame "obj" to which the pose leads.
+        """Return the point of every pixel (h, w, 3) [m], in the frame "obj" to which the pose
+        leads.
 
         Where nothing was measured it is the camera's position.
         """
@@ -144,7 +145,8 @@ class DepthImage(Value):
         """Return whether an object reaches the border of the camera's image, in 5 pixels or more.
 
         `pixels` holds row and column of each of the object's n pixels. The bound is
-        `IMAGE.border_pixels`. An image that is not `bounded` gives False.
+        `IMAGE.border_pixels`. An image that is not `bounded` gives False. Pixels in the two
+        outermost rows and columns count as at the border.
         """
         last = torch.tensor(self.depth.shape, device=pixels.device) - 1
         reaching = ((pixels <= 1) | (pixels >= last - 1)).any(-1)
@@ -212,8 +214,8 @@ def scale_pixels(count: int, labels: Int[Tensor, "h w"]) -> float:
 def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> Float[Tensor, "k"]:
     """Return the root mean square distance [m] of the points of each label from their mean.
 
-    Entry i of the result is for label i, from 0 to the greatest one. `labels` holds the label of
-    each of the h x w `points` [m].
+    Entry i of the result is for label i, from 0 to the greatest one. A label without points gets 0.
+    `labels` holds the label of each of the h x w `points` [m].
     """
     label = labels.reshape(-1)
     own = points.reshape(-1, 3)

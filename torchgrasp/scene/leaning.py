@@ -36,21 +36,21 @@ class LeaningNumbers:
     the table.
     """
     high: float = 0.8
-    """Greatest height of these points, as a share of the object's height. Higher ones may be on a
-    rounded rim.
+    """Greatest height of points on a side, as a share of the object's height. Higher ones may be on
+    a rounded rim.
     """
     steep: float = 45.0
     """Greatest angle [deg] of a side to the vertical."""
     facing: float = 0.6
     """Least cosine between the normal of a side and the horizontal direction to the camera."""
     share: float = 0.15
-    """Least share of an object's points on such a side."""
+    """Least share of an object's points that lie on its side."""
     even: float = 6.5
     """Greatest median deviation [deg] of a side's lean, if it is flat or cylindrical. Round sides
     have more.
     """
     fewest: int = 2
-    """Least number of objects with such a side: one may be tapered."""
+    """Least number of objects with a side whose lean is measured: a single one may be tapered."""
     alike: float = 6.5
     """Greatest difference [deg] of a side's lean from the median one, at which sides lean alike."""
     most: float = 0.66
@@ -69,9 +69,10 @@ def tell_leaning(
 ) -> tuple[str, ...]:
     """Return one note, a sentence, if the sides of several objects lean alike, else none.
 
-    They lean by 12 degrees (`LEANING.told`) or more, as by a wrong focal length. `labels` (n,)
-    holds the object of each of the `points` (n, 3) [m], 0 for none. The `pose` (4, 4) [m] leads
-    from the camera's frame to that of the points and the `table`.
+    They lean from the vertical by 12 degrees (`LEANING.told`) or more, towards or away from the
+    camera. A wrong focal length makes sides lean so. `labels` (n,) holds the object of each of the
+    `points` (n, 3) [m], 0 for none. The `pose` (4, 4) [m] leads from the camera's frame to that of
+    the points and the `table`.
     """
     eye = pose[:3, 3].double().cpu()
     forward = pose[:3, 2].double().cpu()

@@ -99,7 +99,8 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
 def read_told_labels(
     labels: Any, shape: tuple[int, ...], name: str = "labels"
 ) -> tuple[Int[Tensor, "..."], tuple[str, ...]]:
-    """Return the labels of `read_labels`, and notes, a sentence for each mask that others cut.
+    """Return the labels that `read_labels` returns, and notes, a sentence for each mask that others
+    cut. The arguments and errors are those of `read_labels`.
 
     Of a mask within another one, both stay objects. So a mask of a part, such as a handle, cuts its
     object in two.
@@ -285,14 +286,15 @@ def _run_lengths(text: bytes) -> list[int]:
 def label_image(
     view: TableImage, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
 ) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
-    """Return the label (h, w) of each pixel of a `view`, and notes, a sentence each. Labels, a mask
-    or neither may be given.
+    """Return the label (h, w) of each pixel of a `view`, and notes, a sentence each. `labels`, a
+    `mask` or neither may be given, each (h, w).
 
-    Given labels lose pixels on the table and flying pixels. Without labels the image is segmented.
-    A mask becomes label 1, and loses strips of neighbouring objects, too. Pixels of the mask's
-    object just outside of the mask get label 0. A note names each mask that loses more than a
-    twentieth of its pixels. Raises `BadArgument` for a mask that keeps under 5 % or 30 of its
-    pixels, or labels that keep none.
+    Given labels lose pixels on the table and flying pixels. A label that is mostly on the table,
+    and keeps under 5 % of its pixels, is removed. Without labels the image is segmented. A mask
+    becomes label 1, and loses strips of neighbouring objects, too. Pixels of the mask's object just
+    outside of the mask get label 0. A note names each mask that loses more than a twentieth of its
+    pixels. Raises `BadArgument` for a mask that keeps under 5 % or under 30 of its measured pixels.
+    It is also raised for labels that keep none.
     """
     if labels is not None:
         return _trim_labels(view, labels)
@@ -385,8 +387,8 @@ def label_again(
     The new `support` and the `former` table are in the frame of the image's pose. Labels that the
     user gave (`given`) lose pixels on the support. They gain pixels of their objects that the
     former table hid. Other objects are segmented again, and each keeps the label of most of its
-    former pixels. The label `first` is assigned before the others. `labels` (h, w) are the labels
-    until now.
+    former pixels. New objects get new labels. The label `first` is assigned before the others.
+    `labels` (h, w) are the labels until now.
     """
     view = TableImage.of(image, support)
     before = TableImage(image, view.points, SupportPlane(former))

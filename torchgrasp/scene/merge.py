@@ -3,8 +3,8 @@ object.
 
 Two pieces belong to one object if they meet at two ends, as a handle and its cup do. So do pieces
 of which one is over the footprint of the other. So do pieces that form the rim of a hollow body,
-and a piece that floats beside another. Touching pieces also belong to one object, unless both stand on
-the table or one lies upon the other.
+and a piece that floats beside another. Touching pieces also belong to one object, unless both stand
+on the table or one lies upon the other.
 """
 
 import dataclasses
@@ -36,7 +36,9 @@ class MergeNumbers:
     gap: float = 0.008
     """Distance [m] between points of two pieces below which the pieces touch."""
     touching: int = 3
-    """Least number of points of a piece that are so near: with fewer, the gap is not known."""
+    """Number of a piece's points, the nearest to another piece, of which the farthest gives the
+    gap. With fewer, the gap is not known.
+    """
     far: float = 0.05
     """Greatest distance [m] between parts of one object."""
     spacing: float = 0.0015
@@ -79,13 +81,14 @@ class MergeNumbers:
     upon: float = 0.01
     """Least height [m] of the top of a body over that of another one on which it lies."""
     upon_foot: float = 0.5
-    """Least height of the foot of such a body, as a share of the other's top."""
+    """Least height of the foot of a body that lies on another one, as a share of the other's top.
+    """
     upon_share: float = 0.5
-    """Least share of such a body's points over the body on which it lies."""
+    """Least share of the points of a body on another one that are over that other body."""
     ring_width: float = 0.025
     """Greatest width [m] of the footprint of a standing ring that is seen from its edge."""
     ring_foot: float = 0.01
-    """Least height [m] of the foot of both parts of such a ring, neither of which stands."""
+    """Least height [m] of the foot of both parts of a standing ring, neither of which stands."""
     level: float = 0.005
     """Greatest difference [m] of the tops of two parts of one rim."""
     rim_gap: float = 0.4

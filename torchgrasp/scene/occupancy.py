@@ -36,7 +36,8 @@ class OccupancyNumbers:
     sideways: float = 0.25
     """Horizontal distance [m] by which the voxels extend beyond the target's points."""
     above: float = 0.04
-    """Height [m] by which the voxels extend above the highest point over this area."""
+    """Height [m] by which the voxels extend above the highest point over the area that they cover.
+    """
     noise: float = 0.004
     """Distance [m] in front of a measured depth beyond which space is free: three deviations of the
     noise.
@@ -48,7 +49,7 @@ class OccupancyNumbers:
     masks are off.
     """
     rim_depth: float = 0.02
-    """Greatest difference of depth [m] of such pixels from the target."""
+    """Greatest difference of depth [m] from the target of the unlabelled pixels near it (`rim`)."""
     flying: int = 20
     """Least number of connected unlabelled pixels of an object; fewer are flying pixels."""
     gap: int = 8

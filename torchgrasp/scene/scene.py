@@ -69,11 +69,12 @@ class SceneNumbers:
     several objects. Hands grasp few objects that are longer.
     """
     filled: float = 0.85
-    """Share of the convex hull of its pixels that such a target fills, below which it may be
-    several objects.
+    """Share of the convex hull of its pixels that a long target (`across`) fills. With less, it may
+    be several objects.
     """
     closing: int = 2
-    """Number of pixels by which gaps in a target are closed before this share is measured."""
+    """Number of pixels by which gaps in a target are closed before the share `filled` is measured.
+    """
     lowest: float = 0.02
     """Share of a target's points that may be lower than its foot: outliers."""
     drawn: int = 2000
@@ -83,7 +84,8 @@ class SceneNumbers:
     rims have no label.
     """
     before: float = 0.01
-    """Least distance [m] of such an object in front of the target: objects beside it cover nothing.
+    """Least distance [m] in front of the target of an object that covers it: objects beside it
+    cover nothing.
     """
     covered: float = 0.2
     """Share of the target's outline that one object covers, above which advice names it. Then a

@@ -37,8 +37,8 @@ class SegmentNumbers:
     near: float = 0.005
     """Distance [m] from an object within which a pixel at a jump of depth joins it."""
     near_pixels: float = 4.0
-    """The same distance in widths of a pixel, if that is more, for a pixel of a given mask. Pixels
-    of a small image lie farther apart.
+    """The distance `near` in widths of a pixel, if that is more, for a pixel of a given mask.
+    Pixels of a small image lie farther apart.
     """
     rounds: int = 12
     """Greatest number of rounds in which objects grow into pixels at jumps."""
@@ -49,7 +49,9 @@ class SegmentNumbers:
     high: float = 0.005
     """Least height [m] of a pixel that counts as high; an uneven table has few such pixels."""
     high_deviations: float = 4.0
-    """Least height of such a pixel in standard deviations of the table's noise, if that is more."""
+    """Least height of a high pixel (`high`) in standard deviations of the table's noise, if that is
+    more.
+    """
     high_share: float = 0.1
     """Least share of high pixels among those of an object."""
     over: float = 0.2
@@ -69,7 +71,9 @@ class SegmentNumbers:
     exceed.
     """
     uneven_share: float = 0.25
-    """Least share of a small object's pixels that exceed this height; else it is noise."""
+    """Least share of a small object's pixels that exceed the height `uneven`; else the object is
+    noise.
+    """
     margin: int = 4
     """Distance [px] from a small object within which a large one is sought, of which it may be a
     fringe.
@@ -155,12 +159,11 @@ def _risen(view: TableImage) -> Bool[Tensor, "h w"]:
 
 
 def above_table_not_flying(view: TableImage) -> Bool[Tensor, "h w"]:
-    """Return a mask of the pixels above the table, without flying pixels: those beside at most one
-    jump of depth.
+    """Return a mask of the pixels above the table that are not flying pixels.
 
     A flying pixel lies between a nearer and a farther surface. So the depth jumps back beside it on
     one side, and forward on another. The pixels of a thin bar are beside jumps back only. They are
-    in this mask, but not in that of `rests_on`.
+    in the result, but not in the mask of `rests_on`.
     """
     before_jump, behind_jump = _jumps(view.smooth)
     return _risen(view) & ~(before_jump & behind_jump)

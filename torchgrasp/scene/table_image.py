@@ -86,7 +86,7 @@ class TableImage(Value):
 
     @kept
     def mean_height(self) -> Float[Tensor, "h w"]:
-        """The mean height above the table of the 5 x 5 pixels around each pixel [m].
+        """The mean height [m] above the table of the 5 x 5 pixels around each pixel.
 
         Only measured pixels within 30 mm (`HEIGHT.foot`) of the table count; all others keep their
         height.
@@ -107,7 +107,8 @@ class TableImage(Value):
 
     @kept
     def median_noise(self) -> float:
-        """The standard deviation [1/m] of the table's noise, divided by the squared depth.
+        """The standard deviation [m] of the noise of the table's heights over the squared depth
+        [m^2]: a number [1/m].
 
         It is 1.4826 times the median of |mean height| / depth^2 over the pixels on the table
         (`flat`). A few outliers do not move it. It is 0 if no pixel shows the table.

@@ -2,8 +2,9 @@
 its own cloud.
 
 Some stages work on batches of contacts or hands. They ask a shape for values at the points of each
-entry. Then they continue with those of its `rows` that are left. A `ShapeGP` is the one shape of
-all entries. A `ShapeBatch` stacks the observations of c clouds, and knows the cloud of each entry.
+entry. When entries drop out, they continue with the shape of those that are left (`rows`). A
+`ShapeGP` is the one shape of all entries. A `ShapeBatch` stacks the observations of c clouds, and
+knows the cloud of each entry.
 """
 
 import dataclasses

@@ -87,21 +87,23 @@ class FreeNumbers:
     loses rims.
     """
     estimated_error: float = 0.010
-    """The same distance [m] for a camera whose position is estimated."""
+    """Distance [m] by which the object may reach beyond its outline for a camera whose position is
+    estimated.
+    """
     radius: float = 1.15
     """Ratio of the radius within which free space is observed to that of all points."""
     ground: int = 9
     """Number of points along each side of a square grid below the table."""
     ground_side: float = 0.9
-    """Half the side of this square, normalised."""
+    """Half the side of the square grid below the table, normalised."""
     below: tuple[float, ...] = (0.003, 0.012)
-    """Depths [m] of the points of this grid below the table."""
+    """Depths [m] below the table of the points of the square grid."""
     least: float = 0.001
     """Least distance [m] from the surface that is used as a bound."""
     beside: tuple[float, ...] = (0.008, 0.016)
     """Distances [m] of camera rays from the outline."""
     rays: int = 32
-    """Number of camera rays at each of these distances."""
+    """Number of camera rays at each distance `beside` the outline."""
     depths: int = 13
     """Number of points along each ray, over the object's depth."""
     violation: float = 0.002
@@ -109,7 +111,8 @@ class FreeNumbers:
     space.
     """
     violations: int = 16
-    """Greatest number of such points that are observed in addition, in one round."""
+    """Greatest number of points that violate free space and are observed in addition, in one round.
+    """
 
 
 FREE = FreeNumbers()

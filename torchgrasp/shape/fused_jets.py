@@ -76,9 +76,9 @@ def sum_thin_plate(x, y, a, b, psi, bent):
     """Return distance, gradient and Hessian of a posterior mean at a point x, as tuples.
 
     The mean is that of a surface's signed distance, with a thin plate kernel of length `psi`, all
-    normalised. They are sums over n observed points y (3, n), weighted by a for distances and b for
-    normals. The Hessian is the six numbers xx, yy, zz, xy, xz and yz, which are valid only if
-    `bent`.
+    normalised. The point x has 3 numbers. The results are sums over n observed points y (3, n). The
+    weights are a (n,) of distances and b (3, n) of normals. The Hessian is the six numbers xx, yy,
+    zz, xy, xz and yz, which are valid only if `bent`.
     """
     distance = g0 = g1 = g2 = trace = xx = yy = zz = xy = xz = yz = 0.0
     for j in range(len(a)):

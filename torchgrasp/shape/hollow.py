@@ -261,8 +261,9 @@ def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
 
     `middle` also holds points in the middle of the wall. Two independent surfaces might touch,
     which tears holes into the wall. In the wall's middle the signed distances from both surfaces
-    must sum to minus the thickness. Where they do not, the less certain surface gets an observed
-    distance that follows from the more certain one.
+    must sum to minus the thickness. In a floor, which may be thicker, the sum may be less. Where
+    they do not, the less certain surface gets an observed distance that follows from the more
+    certain one.
     """
     x = middle.x
     thickness = middle.thickness

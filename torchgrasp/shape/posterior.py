@@ -71,7 +71,9 @@ class Posterior(Value):
     All is in normalised units and float64. n counts observed points, and r observed numbers: n
     distances, and three for each observed normal. (d, w) are the signed distance and its gradient.
     All methods but `explain` are differentiable, to any order, in the points and in the posterior's
-    tensors. Plain tensors take faster formulas, which reuse buffers.
+    tensors. Plain tensors take faster formulas, which reuse buffers. The subclass `ShapeGP` has the
+    frame: its `normalise`, `scale`, `domain_radius`, `predict` and `joint` are meant in the
+    methods.
     """
 
     x: Points  # observed points (n, 3), those with normals first

@@ -137,8 +137,8 @@ class ClosureResult(Value):
 
     Attributes:
         held: whether the object was lifted with the hand and slipped little. Its centre then rose
-            by half the lift, and two fingers touch it at the end. It slipped by less than 20 mm and
-            30 degrees.
+            by at least half the lift, and two or more fingers touch it at the end. It slipped by
+            less than 20 mm and 30 degrees.
         status: `OK`, or the reason why the object was not held.
         time: times (t,) [s] at which the control ticks ended, from the start of the simulation.
         forces: normal force (t, f) [N] of each fingertip; 0 without contact.
@@ -166,8 +166,8 @@ class ClosureResult(Value):
         disturbance: unintended contacts of the hand.
         trace: contacts and estimates at every tick.
         phases: times (3,) [s] at which approach, closing and pressing ended. The closing ends when
-            all fingers touch, or are given up. If the trial ended before, the first time is 0, and
-            the others are NaN.
+            all fingers touch, or are given up. A trial may end earlier. Then an approach that did
+            not end has the time 0, and other phases NaN.
         stops: how often the approaching hand stopped at a contact.
         attempts: number of closings of the hand.
         seconds: wall time [s] of the trial.

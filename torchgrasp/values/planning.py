@@ -358,7 +358,7 @@ class Probabilities(Tensor):
 
 
 class NotebookPages(Protocol):
-    """What draws grasps for notebooks: `torchgrasp.app.report.notebook`."""
+    """Interface of the module that draws grasps for notebooks, `torchgrasp.app.report.notebook`."""
 
     def make_sheet(self, grasps: "Grasps", cloud: Any, hand: Any) -> Any:
         """Return what `Grasps.show` returns for these grasps, cloud and hand."""

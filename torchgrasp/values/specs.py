@@ -27,8 +27,8 @@ MASSES = Range(0.001, 10.0)
 """The masses [kg] of objects that are possible."""
 TIP_RADIUS = 0.012
 SEPARATION = 0.026
-"""Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind
-smaller fingertips.
+"""Default least distance [m] between the centres of two fingertips. `TIP_RADIUS` is the default
+radius [m] of a fingertip. Wider links lie behind smaller fingertips.
 """
 FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
 """Radii [m] within which the surface at a contact must be flat; the largest that the object allows

@@ -38,9 +38,11 @@ class AxisNumbers:
     half_weight: float = 0.004
     """Distance [m] of a normal's line from the axis at which the line has half the weight."""
     first_half_weight: float = 0.02
-    """This distance [m] in the first step of the fit of a tilted axis."""
+    """The distance `half_weight` [m] in the first step of the fit of a tilted axis."""
     narrowing: float = 0.6
-    """Factor by which its excess over `half_weight` shrinks from step to step."""
+    """Factor by which the excess of `first_half_weight` over `half_weight` shrinks from step to
+    step.
+    """
     steep: float = 0.3
     """Least length of the horizontal part of the unit normals that fit a vertical axis."""
     rounds: int = 30
@@ -54,7 +56,7 @@ class AxisNumbers:
     the axis's direction, and a prism not its position along a side.
     """
     least_diagonal: float = 1e-9
-    """Least value of the diagonal of which this share is taken."""
+    """Least value of the diagonal of which the share `damping` is taken."""
     turn: float = 0.3
     """Greatest rotation [rad] of the axis in a step. The lines' distances are linear only in small
     rotations.
@@ -75,13 +77,13 @@ class RoundNumbers:
     point.
     """
     least_radius: float = 0.01
-    """Least radius [m] that is used as this divisor."""
+    """Least radius [m] by which the distance of a normal's line from the axis is divided."""
     roundness: float = 0.055
     """Part of a bound that grows with the radius r of the body. The RMS distance of the normals'
     lines from a tilted axis may be at most sqrt((`roundness` r)^2 + `error`^2).
     """
     error: float = 0.0018
-    """Part [m] of this bound that is the same for all radii."""
+    """Part [m] of the bound of the RMS distance (`roundness`) that is the same for all radii."""
     spread: float = 0.075
     """Greatest RMS distance of the normals' lines from the axis of an upright body, over its
     radius.
@@ -102,7 +104,7 @@ class RoundNumbers:
     inside: float = 0.003
     """Depth [m] in free space or in the table beyond which a rotated point is not on the object."""
     free: float = 0.12
-    """Greatest share of such points in the rotated body."""
+    """Greatest share of the points of the rotated body that are not on the object (`inside`)."""
 
 
 ROUND = RoundNumbers()
@@ -121,9 +123,10 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
     axis.
 
     `axis_from_cloud` is the rigid transform [m] to a frame whose z axis is the axis of revolution.
-    `body` is in this frame. The result is None if there is no such body. The axis is fitted to the
-    probes of the scorer, which are points of the cloud. The body, rotated about the axis, must stay
-    out of the table. It must also stay out of the space that the cameras saw to be empty.
+    `body` holds the axis position (0, 0) in this frame, and the mask of its points. The result is
+    None if there is no such body. The axis is fitted to the probes of the scorer, which are points
+    of the cloud. The body, rotated about the axis, must stay out of the table. It must also stay
+    out of the space that the cameras saw to be empty.
     """
     center, direction, cost = _fit_axis(*scorer.probes)
     if not cost < AXIS_FIT.cost:

@@ -52,8 +52,8 @@ class HiddenNumbers:
     foot: float = 0.004
     """Greatest height [m] above the table of points on the face on which the object stands."""
     down: float = -0.7
-    """Greatest component, along the upward direction, of the unit normals of this face, which point
-    down.
+    """Greatest component, along the upward direction, of the unit normals of the face on which the
+    object stands.
     """
     attached: int = 20
     """Least number of points of a part attached to a body of revolution, such as a handle."""
@@ -78,9 +78,9 @@ class MirrorNumbers:
     near: int = 5
     """Number of planes, along each axis of a grid, that are compared near a mirror plane."""
     angle: float = 0.15
-    """Greatest rotation [rad] of these planes."""
+    """Greatest rotation [rad] of the planes near a mirror plane."""
     shift: float = 0.045
-    """Greatest shift of these planes, over the size of the cloud."""
+    """Greatest shift of the planes near a mirror plane, over the size of the cloud."""
     twice: float = 0.05
     """Score that an image loses by being mirrored twice, so that single images come first."""
 
@@ -113,8 +113,9 @@ class BarNumbers:
 
 BAR = BarNumbers()
 Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "whole"]
-"""What the hidden side was estimated from: an ellipsoid, an axis, mirror planes, or only the
-outline (a guess).
+"""How the hidden side was estimated: by an ellipsoid, an axis, mirror planes, or the walls of a
+vessel. "guess" means from the outline alone. It was not estimated if the image border cuts the
+object off. A "whole" cloud has no hidden side.
 """
 SomeHidden = TypeVar("SomeHidden", bound=Any)  # a batch with `points` [m]
 

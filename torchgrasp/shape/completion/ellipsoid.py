@@ -51,8 +51,8 @@ class EllipsoidNumbers:
     spread: int = 400
     """Number of points that are spread over the whole ellipsoid."""
     step: float = 1e-5
-    """Step of the ellipsoid's parameters ([m], or of a logarithm) by which these points are
-    differentiated.
+    """Step of the ellipsoid's parameters ([m], or of a logarithm) by which the points spread over
+    it are differentiated.
     """
     least_radius: float = 0.25
     """Least radius of the ball with which the fit begins, over the longest side of the cloud."""

@@ -33,7 +33,7 @@ class OutlineNumbers:
     grow: float = 2.0
     """Radius, in spacings, of the discs about the pixels whose union is the outline at first."""
     shrink: float = 1.65
-    """Distance, in spacings, by which this outline is then shrunk."""
+    """Distance, in spacings, by which the union of the discs (`grow`) is then shrunk."""
     neighbours: int = 5
     """Number of nearest pixels, with the pixel itself, of which the farthest gives the spacing."""
     fine: float = 4.0
@@ -58,11 +58,11 @@ class OutlineNumbers:
     taken.
     """
     least_slope: float = 1e-12
-    """Least length of this slope that is a divisor."""
+    """Least length (no unit) of the slope of the distance from the outline that is a divisor."""
     rim: int = 16
     """Greatest number of points that are taken on the outline."""
     rim_neighbours: int = 4
-    """Number of pixels beside such a point whose median depth it gets."""
+    """Number of pixels beside a point on the outline whose median depth the point gets."""
 
 
 OUTLINE = OutlineNumbers()

@@ -140,8 +140,8 @@ class SymmetryScorer:
     images.
 
     The images are compared with the cloud, with the outlines of the views, and with the table. All
-    is in the frame of the cloud. The z axis of an `upright` scorer is the vertical direction, or
-    the axis of a body of revolution.
+    is in one frame: that of the cloud, until `about_axis`. The z axis of an `upright` scorer is the
+    vertical direction, or the axis of a body of revolution.
     """
 
     points: Points  # points (n, 3) [m] of the cloud
@@ -277,7 +277,9 @@ def find_planes(
     On a table, the search tries only vertical planes. A plane perpendicular to the best one is
     added if none was found near it. Its mirror images are hidden, so that the cloud cannot confirm
     it. A horizontal plane at half the height is added to give the underside. A body of revolution
-    (`turned`) needs neither, because every plane through its axis matches.
+    (`turned`) gets neither, because every plane through its axis matches. Without a table, a plane
+    that mirrors the ends of such a body may be added. For such a body, and without a table, a plane
+    that faces the cameras may be added, too. If no plane is found, p is 0.
     """
     views = [unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]
     view = torch.stack(views).mean(0)
@@ -356,12 +358,12 @@ def planes_near(
     angles: Float[Tensor, "t"],
     shifts: Float[Tensor, "s"],
 ) -> Mirrors:
-    """Return the planes (n, o [m]) near a given `plane`, for all combinations of t angles and s
+    """Return the mirror planes (p, 4) near a given `plane`, for all combinations of t angles and s
     shifts.
 
-    The plane is rotated by `angles` [rad], about z if the scorer is upright, else about two axes in
-    it. The cloud's centre stays at the same distance from it. Then it is shifted by `shifts` [m]
-    along its normal.
+    A plane is (n, o): unit normal and offset [m]. It is rotated by `angles` [rad], about z if the
+    scorer is upright, else about two axes in it. So p is t s, or t t s. The cloud's centre stays at
+    the same distance from it. Then it is shifted by `shifts` [m] along its normal.
     """
     normal = plane[:3]
     if scorer.upright:

@@ -46,7 +46,7 @@ class VesselNumbers:
     not yet known.
     """
     narrowing: float = 0.8
-    """Factor by which this excess shrinks from round to round."""
+    """Factor by which the excess `wider` shrinks from round to round."""
     on_body: float = 0.002
     """Greatest distance [m] of a point of the body from its wall: twice a camera's noise."""
     thinnest: float = 0.0003
@@ -282,7 +282,9 @@ def complete_walls(
 
 
 def lid(vessel: Vessel) -> HiddenWall:
-    """Return 7 points on an imagined flat lid that closes a vessel's outer surface at its rim."""
+    """Return 7 points on an imagined flat lid that closes a vessel's outer surface at its rim. They
+    are in the frame of the vessel.
+    """
     return _disc(vessel, vessel.rim, vessel.radius, WALL.lid_rings)
 
 
