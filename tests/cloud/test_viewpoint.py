@@ -6,14 +6,15 @@ import pytest
 import torch
 import trimesh
 
-from tests.make import box
+from tests.make import box, real
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.diagnose import diagnose_cloud
 from torchgrasp.cloud.neighbours import draw_rows, fit_local_planes
-from torchgrasp.cloud.viewpoint import can_see, guess_viewpoint
+from torchgrasp.cloud.viewpoint import can_see, guess_viewpoint, share_unseen
 from torchgrasp.data.shipped import list_objects, load_object
 from torchgrasp.geometry.frames import apply, inverse, rotation_from_vector
+from torchgrasp.geometry.linalg import unit
 from torchgrasp.values.planning import PointCloud
 
 ELEVATIONS = (20.0, 45.0, 70.0)
@@ -103,3 +104,27 @@ def test_a_cloud_of_opengls_camera_is_told_and_others_are_not(known):
         assert any("multiply them by diag(1, -1, -1)" in one for one in told)
     for right in (PointCloud(view.points.double(), None, eye), PointCloud(view.points)):
         assert not any("diag" in str(one) for one in diagnose_cloud(right).advice)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_points_that_look_edge_on_from_everywhere_contradict_no_camera(seed):
+    """A camera sees uniform normals with |cos| < .17 in a share of .17, wherever it is."""
+    rng = torch.Generator().manual_seed(seed)
+    flat = torch.rand(4000, 2, generator=rng, dtype=torch.float64) - 0.5
+    points = 0.1 * torch.cat([flat, 0.0 * flat[:, :1]], 1)
+    camera = real([0.0, 0.0, 0.6])
+    frame = share_unseen(points, unit(torch.randn(4000, 3, generator=rng).double()), camera)
+    assert frame.edge_on == pytest.approx(0.17, abs=0.02)
+    assert max(frame.excess) < 1
+
+
+def test_a_plate_that_other_cameras_see_well_contradicts_a_camera_in_its_plane():
+    """A camera 5 degrees above a plate sees all of it edge-on; one above it sees none."""
+    rng = torch.Generator().manual_seed(0)
+    flat = torch.rand(1000, 2, generator=rng, dtype=torch.float64) - 0.5
+    points = 0.1 * torch.cat([flat, 0.0 * flat[:, :1]], 1)
+    up = real([0.0, 0.0, 1.0]).expand(1000, 3)
+    low = share_unseen(points, up, real([0.6, 0.0, 0.05]))
+    high = share_unseen(points, up, real([0.1, 0.0, 0.6]))
+    assert low.edge_on > 0.9 and low.least == 0.0 and low.excess[0] > 1
+    assert high.edge_on == 0.0 and max(high.excess) < 1

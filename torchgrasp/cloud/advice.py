@@ -11,7 +11,7 @@ from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
 from torchgrasp.cloud.parts import PARTS, find_ground, find_second_body
 from torchgrasp.cloud.prepare import FACING, INWARD, point_inward, share_facing
-from torchgrasp.cloud.viewpoint import GUESS, UNSEEN, is_along_z, share_unseen
+from torchgrasp.cloud.viewpoint import GUESS, Unseen, is_along_z, share_unseen
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial
@@ -122,8 +122,9 @@ def judge_view(
 def check_camera(clean: PointCloud) -> None:
     """Raise `BadArgument` if a camera at a cloud's `viewpoint` cannot have seen the cloud's points.
 
-    It cannot if over 15 % of the points would be edge-on (`UNSEEN.edge_on`). It cannot either if
-    over 20 % would lie behind others (`UNSEEN.behind`). `clean` is a cloud without outliers, with
+    It cannot if over 15 % of the points would be edge-on (`UNSEEN.edge_on`), unless no other
+    direction would show half as many. It cannot either if over 20 % would lie behind others
+    (`UNSEEN.behind`). `clean` is a cloud without outliers, with
     normals of either sign. A cloud without viewpoint raises nothing, nor does a view of fewer than
     50 points.
     """
@@ -191,18 +192,18 @@ def _contradict(clean: PointCloud) -> str | None:
 
     Views of fewer than 50 points (`ADVICE.fewest`) contradict nothing. `clean` has normals.
     """
-    worst = (0.0, 0.0)
+    worst = Unseen()
     for view in clean.split_views():
         eye = view.viewpoint
         if eye is not None and view.normals is not None and len(view) >= ADVICE.fewest:
             shares = share_unseen(view.points.double(), view.normals.double(), eye.double())
-            worst = max(worst, shares, key=lambda shares: max(UNSEEN.excess(shares)))
-    edge_on, behind = UNSEEN.excess(worst)
+            worst = max(worst, shares, key=lambda shares: max(shares.excess))
+    edge_on, behind = worst.excess
     if max(edge_on, behind) <= 1:
         return None
     if edge_on > behind:
-        return f"sees {worst[0]:.0%} of them edge-on"
-    return f"has {worst[1]:.0%} of them behind others"
+        return f"sees {worst.edge_on:.0%} of them edge-on"
+    return f"has {worst.behind:.0%} of them behind others"
 
 
 def _judge_table(cloud: PointCloud, clean: PointCloud, table: Plane) -> Advice | None:

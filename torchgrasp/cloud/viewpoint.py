@@ -21,6 +21,12 @@ class UnseenNumbers:
 
     edge_on: float = 0.15
     """Greatest share of points that the camera sees edge-on."""
+    elsewhere: float = 2.0
+    """Greatest ratio between this share and the least one of a camera in another direction. Thin
+    frames look edge-on from everywhere, so their true camera may exceed `edge_on`.
+    """
+    directions: int = 64
+    """Number of the other directions, which are about 25 degrees apart."""
     behind: float = 0.2
     """Greatest share of points that lie behind others."""
     grazing: float = 0.17
@@ -31,14 +37,6 @@ class UnseenNumbers:
     """Greatest slope of a surface, its depth divided by its width, that hides nothing."""
     step: float = 0.1
     """Least step of depth behind which points are hidden, as a share of the cloud's radius."""
-
-    def excess(self, shares: tuple[float, float]) -> tuple[float, float]:
-        """Return two shares of a view's points, each divided by its bound (`edge_on`, `behind`).
-
-        `shares` are those of the points seen edge-on, and hidden behind others (`share_unseen`). A
-        result above 1 means that the camera cannot have seen the points.
-        """
-        return shares[0] / self.edge_on, shares[1] / self.behind
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +92,31 @@ class GuessNumbers:
 
 UNSEEN = UnseenNumbers()
 GUESS = GuessNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class Unseen:
+    """Shares in [0, 1] of a view's points that a camera can hardly have seen.
+
+    Args:
+        edge_on: share of the points that the camera sees edge-on.
+        behind: share of the points that are hidden behind others.
+        least: least share edge-on of a camera in another direction, at the same distance. It is 0
+            where `edge_on` is within its bound.
+    """
+
+    edge_on: float = 0.0
+    behind: float = 0.0
+    least: float = 0.0
+
+    @property
+    def excess(self) -> tuple[float, float]:
+        """The shares `edge_on` and `behind`, each divided by its bound (`UNSEEN`).
+
+        A number above 1 means that the camera cannot have seen the points.
+        """
+        edge_on = max(UNSEEN.edge_on, UNSEEN.elsewhere * self.least)
+        return self.edge_on / edge_on, self.behind / UNSEEN.behind
 
 
 def guess_viewpoint(
@@ -175,14 +198,14 @@ def _is_ahead(points: Points, centre: Vector, radius: Float[Tensor, ""]) -> bool
 def can_see(points: Points, normals: Points, viewpoint: Vector) -> bool:
     """Return whether a camera at `viewpoint` (3,) [m] can have seen the points of a view.
 
-    It must see at most 15 % of them edge-on, and at most 20 % behind others (`UNSEEN`). In
-    addition, one of three conditions must hold. First, the camera's pixels explain how dense the
-    points are. Second, no other camera position explains the points much better. Third, the camera
-    looks down on a support. `points` are (n, 3) [m]; `normals` (n, 3) are unit vectors of either
-    sign.
+    It must see at most 15 % of them edge-on, and at most 20 % behind others (`UNSEEN`). Of a thin
+    frame it may see twice the share edge-on that the best other camera sees. In addition, one of
+    three conditions must hold. First, the camera's pixels explain how dense the points are. Second,
+    no other camera position explains the points much better. Third, the camera looks down on a
+    support. `points` are (n, 3) [m]; `normals` (n, 3) are unit vectors of either sign.
     """
     points, normals = _draw(points, normals)
-    if max(UNSEEN.excess(share_unseen(points, normals, viewpoint))) > 1:
+    if max(share_unseen(points, normals, viewpoint).excess) > 1:
         return False
     centre, radius = _enclose(points)
     others = centre + GUESS.distance * radius * fibonacci_sphere(GUESS.directions).to(points)
@@ -234,7 +257,7 @@ def _explain(
     return bulging, 1 - error / density.abs().mean().clamp_min(GUESS.least)
 
 
-def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[float, float]:
+def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> Unseen:
     """Return the share of points that a camera sees edge-on, and the share hidden behind others.
 
     A point is seen edge-on if its ray is at more than 80 degrees to the normal (`UNSEEN.grazing`).
@@ -242,12 +265,31 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
     (n, 3) [m]; `normals` (n, 3) are unit vectors of either sign.
     """
     points, normals, viewpoint = (x.cpu() for x in (points, normals, viewpoint))
-    ray = unit(points - viewpoint)
-    edge_on = float((dot(ray, normals).abs() < UNSEEN.grazing).double().mean())
     middle = (points.amax(0) + points.amin(0)) / 2
+    edge_on = float(_share_edge_on(points, normals, viewpoint[None]))
+    least = 0.0
+    if edge_on > UNSEEN.edge_on:
+        directions = fibonacci_sphere(UNSEEN.directions).to(points)
+        others = middle + norm(viewpoint - middle) * directions
+        least = float(_share_edge_on(points, normals, others).min())
+    return Unseen(edge_on, _share_behind(points, viewpoint, middle), least)
+
+
+def _share_edge_on(
+    points: Points, normals: Points, viewpoints: Float[Tensor, "k 3"]
+) -> Float[Tensor, "k"]:
+    """Return the share of points that each of k cameras sees edge-on."""
+    ray = unit(points[:, None] - viewpoints)  # (n, k, 3)
+    return (dot(ray, normals[:, None]).abs() < UNSEEN.grazing).to(points).mean(0)
+
+
+def _share_behind(points: Points, viewpoint: Vector, middle: Vector) -> float:
+    """Return the share of points that are hidden behind others. It is 1 if a point is behind the
+    camera.
+    """
     forward = middle - viewpoint
     if not forward.any() or ((points - viewpoint) @ forward <= 0).any():
-        return edge_on, 1.0  # within the cloud, or beside it
+        return 1.0  # within the cloud, or beside it
     axes = torch.linalg.svd(unit(forward)[None]).Vh  # forward, or backward, and two axes across
     local = (points - viewpoint) @ axes.T
     depth = local[:, 0].abs()
@@ -258,4 +300,4 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
     step = (depth[:, None] - depth[torch.from_numpy(index)]).abs()
     step = step - UNSEEN.slope * torch.from_numpy(apart).to(depth) * depth[:, None]
     radius = norm(points - middle).max()
-    return edge_on, float((step.amax(1) > UNSEEN.step * radius).double().mean())
+    return float((step.amax(1) > UNSEEN.step * radius).double().mean())
