@@ -189,8 +189,8 @@ def least_friction_forces(
         preferred: positive ratios (*b, f) or (f,) of the normal forces to prefer among forces of
             similar friction, without unit. None means equal ones.
 
-    Raises `BadArgument` for another number of contacts, normals that are not of length 1 (to
-    1e-3), or a `strongest` that is not positive.
+    Raises `BadArgument` for another number of contacts, or a `strongest` that is not positive. On
+    the CPU it is also raised for normals that are not of length 1 (to 1e-3).
 
     >>> points = torch.tensor([[[0.0, 1, 0], [0, 0, 0], [1, 0.5, 0]]])
     >>> normals = torch.tensor([[[-1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]])

@@ -166,8 +166,8 @@ def hold_probability(
             tangents, 0 to pi / 4. It is one number for all contacts, or one for each (b, f).
         shift: standard deviation [m] of the object's position along each of three axes, 0 to 0.1.
             Such an error moves all contacts together along the surface.
-        turn: standard deviation [rad] of the object's rotation about each of three axes through the
-            contacts' centroid, 0 to pi / 4.
+        turn: standard deviation [rad] of the object's rotation about each of three axes, 0 to
+            pi / 4. The axes pass through the contacts' centroid.
         weight: the weight that the contacts carry. None means that they must resist any load, with
             normal forces as large as needed.
         shape: the uncertain shape in the frame of the contacts. Random surfaces are drawn from it

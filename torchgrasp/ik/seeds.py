@@ -240,7 +240,7 @@ def nearest_postures(
             library.
         BadArgument: contacts on another device than the library, or of another number than
             fingertips.
-        BadArgument: normals that are not of length 1 (to 1e-3).
+        BadArgument: normals that are not of length 1 (to 1e-3), if they are on the CPU.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

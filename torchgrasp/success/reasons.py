@@ -100,8 +100,8 @@ def explain_success(
         task: what the grasp must do; None means `GraspTask()`.
 
     Raises `BadArgument` for no grasps, or grasps of another planner. It is raised for a hand or
-    fingers that the grasps do not name. It is also raised for a shape whose surface is more than
-    20 mm (`SLACK`) from half of the contacts, as in another frame.
+    fingers that the grasps do not name. It is also raised for a shape in another frame: its surface
+    is more than 20 mm (`SLACK`) from half of the contacts.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
