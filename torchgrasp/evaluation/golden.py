@@ -1,8 +1,8 @@
 """The golden set: shipped grasps with known verdicts, to check that an installed simulator works.
 
 `scripts/train.py golden` makes the grasps. In two cases the hand is displaced by 60 mm, so that the
-fingers miss the object. One heavy object weighs a little less, another a little more than 0.65 kg.
-Fingers can carry this by friction with 4 N.
+fingers miss the object. Two heavy objects weigh 0.5 and 0.8 kg. Two opposite fingers that press
+with 4 N carry at most 0.65 kg at a friction of 0.8.
 """
 
 from collections.abc import Iterator

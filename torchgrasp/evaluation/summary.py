@@ -46,10 +46,12 @@ class ProtocolResult(Value):
         passed: whether the trial passed: the object withstood all pulls, or the lift fulfilled the
             protocol's `criterion`.
         status: how the trial ended: `OK`, or why it failed.
-        moved: motion [m] of the object's centre: in pulls in the world, in a lift relative to the
-            hand.
-        turned: rotation [rad] of the object: in pulls in the world, in a lift relative to the hand.
-        force: mean normal force [N] of the fingers, before the first pull or at the end of a lift.
+        moved: motion [m] of the object's centre. In pulls it is the motion in the world from the
+            start of the trial (`PullResult`). In a lift it is the motion relative to the hand from
+            the end of the approach.
+        turned: rotation [rad] of the object, counted as for `moved`.
+        force: mean normal force [N] of the fingers, at the end of the closing for pulls, or at the
+            end of a lift.
         overlap: depth [m] by which the hand at the planned posture penetrates the object, before
             any force. The trial's pose error is included. It is at most 0 without penetration.
         seconds: CPU time [s] of the trial, with all tries.
