@@ -75,7 +75,7 @@ class Arm(Value):
         tree: forward kinematics of this chain.
         lower: lower limits (n,) of the joints [rad or m].
         upper: upper limits (n,) of the joints [rad or m].
-        speed: greatest speed (n,) of each joint [rad/s or m/s].
+        speed: greatest speed (n,) of each joint [rad/s or m/s]; pi if the URDF gives none.
         obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the object and its
             cloud.
         tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip.
@@ -236,12 +236,12 @@ def load_arm(
     """Read the robot arm that carries a hand from the arm's URDF, for `plan_grasps(arm=)`.
 
     Args:
-        urdf: path of the file. Joint limits are cut to [-2 pi, 2 pi] rad; a joint without limits
-            gets this range.
+        urdf: path of the file. Joint limits are cut to [-2 pi, 2 pi] rad, or m for sliding joints;
+            a joint without limits gets this range.
         hand: the hand on the arm, or its name, or its folder.
         tip: name of the link that carries the hand. None means the link that the most joints move.
             Of several such links, it means the last one in the file. A robot that branches, as
-            one with fingers or with two arms, needs the name.
+            one with several fingers or with two arms, needs the name.
         obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the cloud that is
             planned on. None means the identity.
         tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip; None means

@@ -45,7 +45,7 @@ class CampaignSpec(Value):
             (`torchgrasp.evaluation.EvaluationSpec`).
         licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
         jobs_in_shard: number of jobs in one file. A job is one view of one object.
-        device: "cpu", or "cuda" to plan on all views of a file at once. For "cuda" the argument
+        device: "cpu", or "cuda" to plan on a GPU, on all views of a file at once. For "cuda" the argument
             `workers` of `run_campaign` must be the address of a Dask scheduler. The workers of this
             cluster must have the resource "GPU". Grasps may differ from those of a CPU by rounding.
 
@@ -120,7 +120,8 @@ def run_campaign(
         observer: function that is called with the `JobRow` of each finished job.
 
     Raises:
-        DatasetError: no manifest, or none of the objects is in it.
+        DatasetError: the manifest is missing or malformed, has no objects, or lacks an object of
+            `EvaluationSpec.only`.
         BadArgument: an unknown protocol, or no Dask scheduler at the address `workers`.
         BadArgument: `spec.device` is "cuda", but `workers` is not the address of a Dask scheduler.
         BadArgument: a machine of the cluster has other versions or another hand.

@@ -178,19 +178,19 @@ def least_friction_forces(
     Their sum and the sum of their torques are zero. The friction that they need is the greatest
     ratio of tangential to normal force at a contact. It is a little more than the least possible
     one, because equal normal forces are also favoured. For four or five contacts it may be greater
-    by 0.04 (`BALANCE.slack`). All forces of a set are NaN if no balanced forces push at each of its
-    contacts.
+    by 0.04 (`BALANCE.slack`). All forces of a set are NaN if no balanced forces are found that push
+    at each contact.
 
     Args:
         points: positions (*b, f, 3) [m] of the f contacts of each set, 3 to 5.
         normals: outward unit normals (*b, f, 3) of the object. Points, normals and forces are in
             one frame.
-        strongest: normal force [N] of the strongest finger.
-        preferred: ratios (*b, f) or (f,) of the normal forces to prefer among forces of similar
-            friction, without unit. None means equal ones.
+        strongest: greatest normal force [N] in each set; the forces are scaled to it.
+        preferred: positive ratios (*b, f) or (f,) of the normal forces to prefer among forces of
+            similar friction, without unit. None means equal ones.
 
-    Raises `BadArgument` for another number of contacts, normals that are not of length 1 (to
-    1e-3), or a `strongest` that is not positive.
+    Raises `BadArgument` for another number of contacts, or a `strongest` that is not positive. On
+    the CPU it is also raised for normals that are not of length 1 (to 1e-3).
 
     >>> points = torch.tensor([[[0.0, 1, 0], [0, 0, 0], [1, 0.5, 0]]])
     >>> normals = torch.tensor([[[-1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]])

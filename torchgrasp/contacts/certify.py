@@ -66,8 +66,8 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
     If a set is not closed, its `witness` is a unit wrench v that no contact force opposes. It is in
     the frame of the contacts and scaled as w (`Certificate`). For every edge wrench w then v . w >=
-    0, up to rounding. If only the rank is too low, the wrenches are smallest along v. A set with a
-    contact that is not finite is not closed. Its margin and witness are NaN.
+    0, up to rounding. If the margin suffices, but the set is not closed, the wrenches are smallest
+    along v. A set with a contact that is not finite is not closed. Its margin and witness are NaN.
 
     The margin has a first derivative with respect to points and normals:
 

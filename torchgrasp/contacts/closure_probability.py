@@ -274,6 +274,7 @@ class ClosureProbability(Batch):
 
     Attributes:
         probability: share (b,) of random surfaces on which the set has force closure, in [0, 1].
+            For a distribution of the friction it is the mean over 9 frictions.
         standard_error: standard error (b,) of the probability. If k of n surfaces give force
             closure, it is that of a share (k + 1) / (n + 2). So it is never 0.
 
@@ -315,7 +316,7 @@ def closure_probability(
         seed: random seed.
 
     Raises `BadArgument` for a contact that is not finite, or is outside the shape's domain or at
-    its edge. It is also raised for a wrong argument, such as normals that point inward.
+    its edge. It is also raised for a wrong argument, such as normals that on average point inward.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

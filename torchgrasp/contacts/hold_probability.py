@@ -152,8 +152,9 @@ def hold_probability(
     If only the friction is uncertain, the result is exact. It is the probability that the friction
     exceeds the `critical_friction`, and 0 where that is infinite. For the other errors, the result
     is the mean over a fixed set of 64 samples of them. The rest of the error around each sample is
-    included to first order. The result is 0 for the few sets for which the method does not
-    converge. Most of these carry a load far below the normal forces.
+    included to first order. An uncertain mass is split into about 9 ranges, and included to first
+    order in each. The result is 0 for the few sets for which the method does not converge. Most of
+    these carry a load far below the normal forces.
 
     Args:
         contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals.
@@ -165,8 +166,8 @@ def hold_probability(
             tangents, 0 to pi / 4. It is one number for all contacts, or one for each (b, f).
         shift: standard deviation [m] of the object's position along each of three axes, 0 to 0.1.
             Such an error moves all contacts together along the surface.
-        turn: standard deviation [rad] of the object's rotation about each of three axes through the
-            contacts' centroid, 0 to pi / 4.
+        turn: standard deviation [rad] of the object's rotation about each of three axes, 0 to
+            pi / 4. The axes pass through the contacts' centroid.
         weight: the weight that the contacts carry. None means that they must resist any load, with
             normal forces as large as needed.
         shape: the uncertain shape in the frame of the contacts. Random surfaces are drawn from it
@@ -180,10 +181,11 @@ def hold_probability(
     * sets of other than 3 to 5 contacts;
     * normals that are not of length 1 (to 1e-3);
     * numbers outside their range;
-    * contacts that are metres apart, as in millimetres;
+    * a contact more than 2 m from the centroid of its set, as in millimetres;
+    * a `weight.center` more than 2 m from this centroid, or not one for each set;
     * contacts outside the domain of the `shape`, or within 12 mm (`FOOTPRINT`) of its edge. The
       domain is the ball in which the posterior is valid;
-    * normals that point into the `shape`.
+    * normals that on average point into the `shape`.
 
     The result is differentiable twice in contacts, `tilt` and `weight.center`. All contact sets
     use the same random numbers.

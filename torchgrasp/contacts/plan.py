@@ -62,8 +62,9 @@ def plan_contacts(
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods (`ShapeLike`).
         spec: the constraints on contacts; None means `ContactSpec()`.
-        starts: number of random initial guesses (Sec. 6.2 of the paper), or b sets of initial
-            contact points (b, f, 3) [m].
+        starts: number of random initial guesses, or b sets of initial contact points (b, f, 3)
+            [m]. Random guesses are sets of points at which the surface is flat, if possible with
+            force closure. If `spec.flatness` is None, they are drawn as in Sec. 6.2 of the paper.
         seed: random seed of the guesses.
         time_budget: wall time [s] of the call. The result then holds the first guesses that could
             be planned in this time, but at least 25 (`LEAST_STARTS`). None means all.

@@ -42,10 +42,10 @@ class Region(Value):
         distance: function of points (n, 3) [m] in float64 that returns their signed distances (n,)
             [m], negative inside.
         name: name of the region in errors.
-        placed: whether the region must overlap the object, as a box or a mesh must. The object is
-            the cloud and the space behind it. Without an overlap, planning raises `BadArgument` for
-            `keep`, and warns `NoEffect` for `avoid`. If the region holds the whole object, planning
-            warns `NoEffect` for `keep`.
+        placed: whether the region must be at the object, as a box or a mesh must. The object is
+            the cloud and the space behind it. If the region is over 30 mm away, planning raises
+            `BadArgument` for `keep`, and warns `NoEffect` for `avoid`. If the region holds the
+            whole object, planning warns `NoEffect` for `keep`.
 
     >>> from torchgrasp import load_object
     >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)

@@ -100,8 +100,9 @@ class GraspController:
     * an approach whose options allow no stops;
     * an approach whose plan lacks a direction, a table, a surface or tactile fingertips;
     * a `max_force` of the plan that the modes do not keep;
-    * a plan whose parts do not fit: a table or a surface in another frame, normals or an approach
-      that are no unit vectors, a number of drives that is not the hand's.
+    * a plan whose table or surface is in another frame;
+    * a plan whose normals or approach are no unit vectors;
+    * a plan without one positive stiffness for each joint of the URDF.
     """
 
     @checked
@@ -180,8 +181,10 @@ class GraspController:
 
     @property
     def targets(self) -> Targets:
-        """The present `Targets`, those that the last `step` returned, in new tensors, which the
-        receiver may change.
+        """The present `Targets`: those that the last `step` returned.
+
+        Before the first step they are those of the opened hand at the start of its approach or
+        closing. The tensors are new, so the receiver may change them.
         """
         return self._sent.copied()
 
@@ -197,9 +200,9 @@ class GraspController:
         """Whether the hand has closed and pressed for 0.9 s (`PRESSING_TIME`), so that it may be
         lifted.
 
-        If another attempt is allowed (`ClosingOptions.attempts`), the grasp must also seem strong
-        enough to lift the object. In the closing mode "open_loop" it is true at the end of the
-        motion.
+        The grasp must also seem strong enough to lift the object. This condition counts only if the
+        plan has a table and another attempt is allowed (`ClosingOptions.attempts`). In the closing
+        mode "open_loop" it is true at the end of the motion.
         """
         if not self.closing.feels:
             return self.closing.done
@@ -258,8 +261,9 @@ class GraspController:
         """The displacement (4, 4) [m] of the object, as estimated from the touches.
 
         It is a rigid transform from the planned to the present object. Its frame is that of the
-        hand's root link at the planned pose. It is the identity before any touch, and if the pose
-        is not estimated (`ClosingOptions.pose_estimate`).
+        hand's root link at the planned pose. It is the identity before any touch, and until the end
+        of the first approach. It is always so if the pose is not estimated
+        (`ClosingOptions.pose_estimate`).
         """
         closing = self.closing
         if not isinstance(closing, UncertaintyClosing):
@@ -350,11 +354,14 @@ class GraspController:
             period: time [s] until the next tick, 1e-5 to 1.
 
         Raises `BadArgument` for an observation of another hand or on another device, or a period
-        out of range. For one that `observe` made, raises it also for:
+        out of range. Raises it for an `up` that is no unit vector. For an observation that
+        `observe` made, raises it also for:
 
-        * a joint that jumps, or is over 0.8 rad off the pre-grasp where the closing begins;
+        * a joint that jumps between two ticks;
+        * a joint over 0.8 rad outside its way from pre-grasp to grasp, where the closing begins;
         * an `up` over 0.5 rad off the table's normal before the hand holds;
-        * a normal force below -1 N, or above 1000 N, as one in millinewtons;
+        * a normal force below -1 N, times `SensorModel.noise` if this is above 1;
+        * a normal force above 1000 N, as one in millinewtons;
         * a fingertip that touches with a force that pulls at the object;
         * its contact point over 0.1 m from its centre, as in another frame or unit;
         * its normal that is no unit vector, or points into the object;

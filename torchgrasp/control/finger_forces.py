@@ -33,12 +33,16 @@ class PreferredForces(Value):
     stiffnesses.
 
     The fingers are in the order of the hand.
+
+    Attributes:
+        forces: mean normal force (3,) [N] of each finger.
+        covariance: covariance (3, 3) [N^2] of these forces.
+        springs: stiffnesses (3,) [N/m] of virtual springs between the fingertips. The springs lie
+            along the sides (0, 1), (1, 2) and (2, 0) of the triangle of fingertips.
     """
 
-    forces: Float[Tensor, "3"]  # mean normal force [N] of each finger
-    covariance: Float[Tensor, "3 3"]  # covariance of these forces [N^2]
-    # stiffness [N/m] of the virtual springs along the sides (0, 1), (1, 2) and (2, 0) of the
-    # triangle of fingertips
+    forces: Float[Tensor, "3"]
+    covariance: Float[Tensor, "3 3"]
     springs: Float[Tensor, "3"]
 
 

@@ -65,8 +65,8 @@ class GripNumbers:
     release: float = 3.0
     """Rate [1/s] at which forces that are not needed fall once the load is steady."""
     changes: float = 2.0
-    """Largest rate [1/s] of the friction coefficient; the part of the reserve that is
-    applied rises twice as fast.
+    """Largest rate [1/s] of the friction coefficient. The applied share of the reserve rises at
+    twice this rate. Near the limits of torque and force it falls at four times this rate.
     """
     over: float = 0.25
     """Time [s] of sliding with forces at their limits after which the load is too heavy."""
@@ -315,7 +315,8 @@ class GripHold:
         """
         share = self.solver.share(wanted, self.normals, jacobian)
         fastest = GRIP.changes * period
-        # the reserve falls twice as fast as it grows
+        # the applied share of the reserve (0 to 1) falls twice as fast as it grows: at 4 and at 2
+        # times the largest rate of the friction coefficient
         cover = self.cover + fastest * (2 if share < GRIP.near else -4)
         self.cover = min(max(cover, 0.0), 1.0)
         goal = self.friction.high if share > 1.0 and self.cover == 0.0 else self.friction.mean

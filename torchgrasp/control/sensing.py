@@ -51,7 +51,7 @@ def feel_flags(tactile: TactileState, touching: Bool[Tensor, "f"]) -> TactileSta
     touch.
 
     The `reading` of a fingertip that touches is 0.3 N (`WAITING_FORCE`), that of any other one 0.
-    Contact points and normals are NaN.
+    The `forces` are 0. Contact points and normals are NaN.
 
     Args:
         tactile: the state at the last control tick; `no_contact` returns the first one.

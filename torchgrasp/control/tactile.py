@@ -163,7 +163,8 @@ def measure(
     noise and sampling of the sensors.
 
     Vectors are in the frame of the hand's root link. f counts fingertips, and `*b` stands for
-    leading axes that all tensors share.
+    leading axes that all tensors share. The sensors are sampled at 100 Hz (`SAMPLING_RATE`). In a
+    tick without a sample, only `lagged` and `age` change.
 
     Args:
         tactile: the state at the last tick; `no_contact` returns the first one.

@@ -85,13 +85,22 @@ STAND = StandNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class ObjectEntry:
-    """The description of an object in the manifest of a folder of objects."""
+    """The description of an object in the manifest of a folder of objects.
 
-    views: dict[str, tuple[float, ...]]  # camera's position (3,) [m] by view's name, at scale 1
-    scale: float  # scale factor of mesh and clouds
-    family: str  # family of similar objects; the object's own name by default
-    group: str  # such as "solid", "thin" or "shell"; "" by default
-    mass: float | None  # mass [kg] of the real object at any scale, or None
+    Attributes:
+        views: position (x, y, z) [m] of the camera of each view, by the view's name. Multiply it by
+            `scale`, as mesh and clouds.
+        scale: scale factor of mesh and clouds ("suggested_scale").
+        family: name of a family of similar objects; the object's own name by default.
+        group: group of the object, such as "solid", "thin" or "shell"; "" by default.
+        mass: mass [kg] of the real object ("mass_kg"), which is not scaled; None if it is unknown.
+    """
+
+    views: dict[str, tuple[float, ...]]
+    scale: float
+    family: str
+    group: str
+    mass: float | None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
         """Return the names of the object's views, sorted, and of these at most the first `most`.
@@ -367,7 +376,7 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
     """Return the noisy point cloud [m] of a view, with the camera's position as `viewpoint`.
 
     The cloud is in the frame of `read_object_mesh`. Its numbers are those of the file times the
-    object's scale in the manifest (1 by default). It has no normals.
+    object's scale in the manifest (1 by default). It has no normals, except for the view "whole".
 
     Args:
         objects: the folder of objects, as `write_objects` makes it.

@@ -57,8 +57,8 @@ class GraspShards:
     * `points` (n, 3) [m] and `viewpoint` (3,) [m] of the cloud; the viewpoint is 0 if unknown.
     * `joints` (h,) of the grasp and `pregrasp` (h,) of the opened hand [rad or m].
     * `approach` (3,), the unit direction of the approach, and the pose `obj_from_hand` (4, 4) [m].
-    * `contacts` (f, 3) [m], with the outward unit `normals` (f, 3) and the standard deviation
-      `std_m` (f,) [m] of the surface there.
+    * `contacts` (f, 3) [m], and the outward unit `normals` (f, 3) of the surface there.
+    * `std_m` (f,) [m], the standard deviation of the surface at each contact.
     * `margin`, a number: the margin of the contacts' force closure, positive if they have it.
     * `witness` (6,), a unit wrench that proves the margin (`Certificate`).
     * `clearance` [m], the least distance of links from surface, table and each other (`Grasps`).
@@ -188,8 +188,8 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
 
     Args:
         folder: the folder that `run_campaign` wrote.
-        points: number of points that are drawn from each cloud, the same ones each time. A cloud
-            with fewer points repeats some. None means all points.
+        points: number of points that are drawn from the cloud for each grasp. The draw of a grasp
+            is the same each time. A cloud with fewer points repeats some. None means all points.
 
     Raises `ModelFileError` if the campaign is not finished, or its card is damaged.
 

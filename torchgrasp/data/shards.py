@@ -32,7 +32,8 @@ class JobRow(NamedTuple):
 
     Attributes:
         object: name of the object.
-        view: name of the view; "" if the object could not be read, or has no view.
+        view: name of the view; "" if the object's entry in the manifest is malformed or names no
+            view.
         status: `OK` if a grasp is executable. Else it is the most frequent failure of the plan, or
             `BAD_OBJECT` for bad files or a failed plan. It is `TIMED_OUT`, `WORKER_DIED` or
             `BROKEN` if the work on the job did not end.
@@ -75,11 +76,11 @@ class Records(Value):
     trials of each grasp. `Shard.rows` says how many points and grasps each job has.
 
     Attributes:
-        points: points [m] of the clouds of all jobs.
-        viewpoints: position [m] of the camera of each job; zeros without a camera.
+        points: points (p, 3) [m] of the clouds of all jobs.
+        viewpoints: position (j, 3) [m] of the camera of each job; zeros without a camera.
         grasps: grasps of all jobs.
-        passed: whether each simulated trial passed.
-        outcome: `Status` of each simulated trial.
+        passed: mask (g, d) of the simulated trials that passed.
+        outcome: `Status` (g, d) of each simulated trial, as an integer.
     """
 
     points: Float[Tensor, "p 3"]

@@ -29,19 +29,32 @@ class Tick(Value):
 
     Poses and points are in the simulator's frame, whose z axis points up. j counts all joints of
     the URDF, in the order of the simulated scene. m counts neighbours: other bodies on the table.
+
+    Attributes:
+        time: time [s] since the start.
+        object_pose: rigid transform (4, 4) [m] that has moved the object since the start.
+        hand_pose: pose (4, 4) [m] of the hand's root link.
+        neighbour_pose: rigid transforms (m, 4, 4) [m] that have moved the neighbours.
+        joints: positions (j,) [rad or m] of the joints.
+        targets: targets (j,) [rad or m] of the drives.
+        touching: number of fingers that touch the object.
+        centre: centre of mass (3,) [m] of the object.
+        felt: coefficient of friction and load [N] (2,), as the controller estimates them.
+        blend: weight lambda (f,) of Eq. (26) for each finger: 0 for position, 1 for force control.
+        truth: true contacts of the fingertips, in the frame of the hand's root link.
     """
 
-    time: Float[Tensor, "*t"]  # since the start [s]
-    object_pose: Float[Tensor, "*t 4 4"]  # pose of the object [m]
-    hand_pose: Float[Tensor, "*t 4 4"]  # pose of the hand's root link [m]
-    neighbour_pose: Float[Tensor, "*t m 4 4"]  # poses of the m neighbours [m]
-    joints: Float[Tensor, "*t j"]  # positions [rad]
-    targets: Float[Tensor, "*t j"]  # targets of the drives [rad]
-    touching: Int[Tensor, "*t"]  # number of fingers on the object
-    centre: Float[Tensor, "*t 3"]  # the object's centre of mass [m]
-    felt: Float[Tensor, "*t 2"]  # friction and load [N] as the controller estimates them
-    blend: Float[Tensor, "*t f"]  # weight lambda of each of f fingers, Eq. (26); a share
-    truth: TipContact  # the true contacts of the fingertips, in the hand's frame
+    time: Float[Tensor, "*t"]
+    object_pose: Float[Tensor, "*t 4 4"]
+    hand_pose: Float[Tensor, "*t 4 4"]
+    neighbour_pose: Float[Tensor, "*t m 4 4"]
+    joints: Float[Tensor, "*t j"]
+    targets: Float[Tensor, "*t j"]
+    touching: Int[Tensor, "*t"]
+    centre: Float[Tensor, "*t 3"]
+    felt: Float[Tensor, "*t 2"]
+    blend: Float[Tensor, "*t f"]
+    truth: TipContact
 
 
 def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: float) -> Status:

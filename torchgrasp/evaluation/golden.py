@@ -1,8 +1,8 @@
 """The golden set: shipped grasps with known verdicts, to check that an installed simulator works.
 
 `scripts/train.py golden` makes the grasps. In two cases the hand is displaced by 60 mm, so that the
-fingers miss the object. One heavy object weighs a little less, another a little more than 0.65 kg.
-Fingers can carry this by friction with 4 N.
+fingers miss the object. Two heavy objects weigh 0.5 and 0.8 kg. Two opposite fingers that press
+with 4 N carry at most 0.65 kg at a friction of 0.8.
 """
 
 from collections.abc import Iterator
@@ -19,13 +19,21 @@ from torchgrasp.values.specs import Simulator, TrialSpec
 
 
 class GoldenCase(NamedTuple):
-    """A test case of the simulation: a shipped grasp, and whether it should hold its object."""
+    """A test case of the simulation: a shipped grasp, and whether it should hold its object.
 
-    object: str  # name of a shipped object
-    hand: str  # name of a shipped hand
-    held: bool  # whether the object should be held
-    shift: float = 0.0  # distance [m] by which the hand is moved back from the object
-    mass: float = 0.1  # mass of the object [kg]
+    Attributes:
+        object: name of a shipped object.
+        hand: name of a shipped hand.
+        held: whether the object should be held.
+        shift: distance [m] by which the hand is moved back from the object, against its approach.
+        mass: mass [kg] of the object.
+    """
+
+    object: str
+    hand: str
+    held: bool
+    shift: float = 0.0
+    mass: float = 0.1
 
 
 GOLDEN = (
@@ -45,11 +53,17 @@ GOLDEN = (
 
 
 class GoldenResult(NamedTuple):
-    """The outcome of a test case of the simulation."""
+    """The outcome of a test case of the simulation.
+
+    Attributes:
+        case: the test case.
+        held: whether the simulated hand held the object.
+        seconds: wall time [s] of the trial.
+    """
 
     case: GoldenCase
-    held: bool  # whether the simulated hand held the object
-    seconds: float  # wall time of the trial [s]
+    held: bool
+    seconds: float
 
     @property
     def right(self) -> bool:

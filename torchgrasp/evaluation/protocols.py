@@ -63,7 +63,8 @@ class PullSpec(Value):
 
     Args:
         acceleration: force of each pull, divided by the object's mass [m/s^2], 0 to 1000.
-        seconds: duration [s] of each pull, 0 to 60.
+        seconds: duration [s] of each pull, 0 to 60. It is rounded to a multiple of 0.2 s, after
+            which the motion is checked each time. At 0.1 s or less there is no pull.
         distance: motion [m] of the object's centre of mass at which a pull fails, 0 to 0.5. It
             counts from the start of the trial, so it includes the closing.
         angle: rotation [rad] of the object, counted likewise, at which a pull fails: 0 to pi, or
@@ -96,8 +97,8 @@ class Protocol(Value):
         trial: parameters of the simulated trials.
         pull: the pulls; None means a lift.
         noise: bounds of random errors: of the hand's pose in pulls, of the object's pose in lifts.
-        criterion: when a lift passes. "held": as `close_hand` defines it. "risen": the object's
-            centre is higher by half of the lift's height at the end.
+        criterion: when a lift passes. "held": as `close_hand` defines it. "risen": at the end, the
+            object's centre is higher by at least half of the lift's height.
         displaced: when `noise` displaces the object of a lift: "before" the approach, or halfway
             through the "approach".
         push: size [N] of a force in a random direction at the lifted object; 0 means no push.
@@ -219,17 +220,18 @@ PROTOCOLS = {
 }
 """The protocols by name.
 
-* multidex: MultiDex as D(R,O) runs it (arXiv 2410.01702).
-* dexgraspbench: force closure for floating objects (as of BODex, arXiv 2412.16490).
-* dexgraspbench-hard: the same with halved friction, as in Dexonomy (arXiv 2504.18829).
-* pose-noise: the same with errors of the hand's pose.
+* multidex: six pulls at a floating object, as in the test of MultiDex that D(R,O) runs (arXiv
+  2410.01702).
+* dexgraspbench: six pulls at a floating object, as in DexGraspBench (BODex, arXiv 2412.16490).
+* dexgraspbench-hard: dexgraspbench with halved friction, as in Dexonomy (arXiv 2504.18829).
+* pose-noise: dexgraspbench with 20 random errors of the hand's pose for each grasp.
 * paper: the paper's lift (Sec. 6.5) at friction 0.8; the object's pose errs at random, as on a real
   robot.
 * tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
 * household: the same at friction 0.8, with the masses of the manifest (`mass_kg`).
 * table-lift: a lift by 0.2 m of 0.249 kg, as published for single-view policies. The friction is
   0.8 at the fingertips and 0.2 at the table. One of three grasps must have raised the object by 0.1
-  m at the end. `noise` and `push` displace and push it.
+  m at the end. To displace or push the object, set `noise` or `push` by `dataclasses.replace`.
 """
 
 

@@ -36,12 +36,13 @@ class PullResult(Value):
         status: how the last pull ended. If no pull was tried, it says how the closing failed.
         directions: number of pulls that were tried, up to 6; 0 if the closing failed.
         moved: largest motion [m] of the object's centre of mass in the world, over all tried pulls.
-            It counts from the start of the trial. It is infinite if the simulation diverged, and 0
-            if the closing did not start.
-        turned: largest rotation [rad] of the object in the world; infinite or 0 in the same cases
-            as `moved`.
-        force: mean normal force [N] of the fingers before the first pull; NaN if the closing did
-            not start.
+            It counts from the start of the trial. If no pull was tried, it is the motion at the end
+            of the closing. It is infinite if the simulation diverged, and 0 if the closing did not
+            start.
+        turned: largest rotation [rad] of the object in the world, counted as for `moved`; infinite
+            or 0 in the same cases.
+        force: mean normal force [N] of the fingers at the end of the closing; NaN if the closing
+            did not start.
         seconds: CPU time [s] of the trial.
     """
 

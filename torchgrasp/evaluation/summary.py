@@ -46,18 +46,21 @@ class ProtocolResult(Value):
         passed: whether the trial passed: the object withstood all pulls, or the lift fulfilled the
             protocol's `criterion`.
         status: how the trial ended: `OK`, or why it failed.
-        moved: motion [m] of the object's centre: in pulls in the world, in a lift relative to the
-            hand.
-        turned: rotation [rad] of the object: in pulls in the world, in a lift relative to the hand.
-        force: mean normal force [N] of the fingers, before the first pull or at the end of a lift.
-        overlap: depth [m] by which the hand at the planned grasp penetrates the object.
-        seconds: CPU time [s] of the trial.
+        moved: motion [m] of the object's centre. In pulls it is the motion in the world from the
+            start of the trial (`PullResult`). In a lift it is the motion relative to the hand from
+            the end of the approach.
+        turned: rotation [rad] of the object, counted as for `moved`.
+        force: mean normal force [N] of the fingers, at the end of the closing for pulls, or at the
+            end of a lift.
+        overlap: depth [m] by which the hand at the planned posture penetrates the object, before
+            any force. The trial's pose error is included. It is at most 0 without penetration.
+        seconds: CPU time [s] of the trial, with all tries.
         slip: motion [m] of the object's centre in the hand from the end of pressing, in a lift.
         slip_angle: rotation [rad] of the object in the hand from the end of pressing, in a lift.
         predicted: predicted probability of success of the grasp.
         tries: number of grasps that were tried. `rank`, `predicted`, `overlap`, `gap_mm`,
-            `deepest_mm` and `touch` are those of the first grasp, all other numbers those of the
-            last.
+            `deepest_mm` and `touch` are those of the first grasp. `passed`, `status` and all
+            motions and forces are those of the last.
         cause: why a lift did not hold the object: the first cause below that applies. It is "" if
             the object was held, if the simulation diverged, or in pulls.
         size: number that goes with the `cause`, in the unit given below; NaN without a cause.
@@ -128,16 +131,16 @@ class ViewScore(Value):
 
     Attributes:
         object: name of the object.
-        view: name of the view; "" if the object could not be read.
+        view: name of the view; "" if the object's entry in the manifest is malformed.
         executable: number of planned grasps that are executable: they passed all checks.
         seconds: CPU time [s] of planning. It is 0 for grasps that were read from a file instead
-            (`EvaluationSpec.planned`). It is NaN if the object could not be read, or planning did
-            not end.
+            (`EvaluationSpec.planned`). It is NaN if the object's entry in the manifest is
+            malformed, or if planning did not end.
         attempts: results of the trials, one for each tried grasp and each random pose error. A pose
             error displaces the hand or the object in a trial (`PoseNoise`).
         refusal: `OK` if a grasp is executable. If planning ended without one, it is the most
-            frequent failure of its candidates, or `OUT_OF_REACH` if no failure is recorded. It is
-            `BAD_OBJECT` if a file is bad, or planning raised an error. It is `TIMED_OUT` or
+            frequent failure of its candidates. It is `OUT_OF_REACH` if no failure is recorded. It
+            is `BAD_OBJECT` if a file is bad, or planning raised an error. It is `TIMED_OUT` or
             `WORKER_DIED` if planning did not end.
         note: details of the refusal, or "".
         family: name of a family of similar objects, or "".
@@ -195,9 +198,10 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     * "success": how well predicted success fits the outcomes, or None without predictions.
       "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for
       perfect predictions, and 0 for a constant prediction, the mean. "auc" is the area under the
-      ROC curve. "skill" and "auc" are NaN if all trials passed, or none. "error" is the expected
-      calibration error over the "bins". A bin holds the predictions from `low` to `high`. Its
-      `predicted` is their mean, and `passed` the `Share` of their trials that passed.
+      ROC curve. "skill" and "auc" are NaN if all trials passed, or none. "bins" are calibration
+      bins of width 0.1. A bin holds the predictions from `low` to `high`. Its `predicted` is their
+      mean, and `passed` the `Share` of their trials that passed. "error" is the expected
+      calibration error over these bins.
 
     >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
     >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)
@@ -324,14 +328,21 @@ def _mean(values: Iterable[float]) -> float | None:
 
 
 class Bin(NamedTuple):
-    """A calibration bin: grasps whose predicted success is in [low, high), and the outcome of their
-    trials.
+    """A calibration bin: the trials of grasps whose predicted success is in [low, high).
+
+    The last bin also holds predictions of 1.
+
+    Attributes:
+        low: least predicted success of the bin.
+        high: upper bound of the predicted success of the bin.
+        predicted: mean predicted success over the trials in the bin.
+        passed: success rate of these trials.
     """
 
-    low: float  # least predicted success of the bin
-    high: float  # upper bound of the predicted success of the bin
-    predicted: float  # mean predicted success of the grasps in the bin
-    passed: Share  # success rate of the trials
+    low: float
+    high: float
+    predicted: float
+    passed: Share
 
 
 def judge(
@@ -347,7 +358,7 @@ def judge(
     * "bins": list of `Bin`, each for an interval of width 0.1 of the prediction.
     * "error": expected calibration error over these bins.
 
-    "skill" is NaN if all trials passed, or none. `units` has n names, such as the families of the
+    "skill" and "auc" are NaN if all trials passed, or none. `units` has n names, such as the families of the
     objects. Trials with the same name count as dependent in the bins' confidence intervals.
     """
     outcome = passed.to(predicted)

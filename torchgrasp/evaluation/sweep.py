@@ -68,7 +68,8 @@ def evaluate(
 
     Raises:
         BadArgument: the protocol is unknown, or the hand has other numbers than its files.
-        DatasetError: the manifest is missing or malformed, or has none of the objects.
+        DatasetError: the manifest is missing or malformed, has no objects, or lacks an object of
+            `EvaluationSpec.only`.
         OutputError: another run holds the folder, or it cannot be written.
         MissingExtra: the simulator is not installed, or pebble for workers.
         NoWorkers: no worker process can start.

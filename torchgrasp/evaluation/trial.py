@@ -267,8 +267,10 @@ class TrialDriver:
         return TrialRun(self)
 
     def grasp_overlap(self) -> float:
-        """Return the penetration depth [m] of the hand into the true object at the planned grasp,
+        """Return the penetration depth [m] of the hand into the true object at the planned posture,
         before any force. It is at most 0 if they do not overlap.
+
+        The hand is at its true pose, which includes the trial's pose error (`Truth.error`).
         """
         joints = joints_by_name(self.reference.hand, self.reference.joints)
         alone = {"approach": (0.0, 0.0, 0.0), "table": False, "neighbours": (), "self_pairs": ()}

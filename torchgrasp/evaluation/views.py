@@ -120,12 +120,19 @@ def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class ObjectView:
-    """A hand and a view of an object: the input of one planning task, named by their files."""
+    """A hand and a view of an object: the input of one planning task, named by their files.
 
-    objects: Path  # folder of objects
-    object: str  # name of the object
-    view: str  # name of the view
-    hand: HandSource  # files and fingers of the hand
+    Attributes:
+        objects: folder of objects.
+        object: name of the object.
+        view: name of the view.
+        hand: files and fingers of the hand.
+    """
+
+    objects: Path
+    object: str
+    view: str
+    hand: HandSource
 
     @property
     def score(self) -> ViewScore:
@@ -145,11 +152,17 @@ class ObjectView:
 
 
 class PlannedView(NamedTuple):
-    """The result of planning on a view."""
+    """The result of planning on a view.
 
-    score: ViewScore  # the score of the view, before any trial
-    cloud: PointCloud | None = None  # the cloud of the view [m]; None for a bad object
-    grasps: Grasps | None = None  # its executable grasps; None for a bad object
+    Attributes:
+        score: score of the view, before any trial.
+        cloud: cloud [m] of the view; None for a bad object.
+        grasps: executable grasps of the view; None for a bad object.
+    """
+
+    score: ViewScore
+    cloud: PointCloud | None = None
+    grasps: Grasps | None = None
 
 
 def plan_views(

@@ -47,12 +47,18 @@ class Column(NamedTuple):
     """How one joint of another program's file becomes a joint of our hand.
 
     Its value in our hand is `factor` times the value in the file, plus `offset`.
+
+    Attributes:
+        joint: name of the joint in the hand's URDF.
+        factor: factor on the value in the file.
+        offset: number [rad, or m for a sliding joint] that is then added.
+        turned: whether the factor is known, so that the sign of the joint is not checked.
     """
 
-    joint: str  # name of the joint in the hand's URDF
-    factor: float = 1.0  # factor on the value in the file
-    offset: float = 0.0  # number [rad, or m for a sliding joint] that is then added
-    turned: bool = False  # whether the user gave the factor
+    joint: str
+    factor: float = 1.0
+    offset: float = 0.0
+    turned: bool = False
 
 
 def read_order(hand: Hand, order: Sequence[str]) -> tuple[Column, ...]:

@@ -141,8 +141,9 @@ def read_foreign(
 
     Coupled joints, and joints of fingers that do not grasp, may differ in the file from the hand's.
     The condition is that this moves no fingertip by over 0.1 mm. A `GraspFileWarning` names values
-    that are not kept, and joints that bend backward. It also tells if an `isaac_grasp` file names
-    no hand in its first line or in the gripper's path.
+    that are not kept. It names joints whose sign may be reversed, because they bend backward in
+    every grasp. It also tells if an `isaac_grasp` file names no hand in its first line or in the
+    gripper's path.
 
     Args:
         path: the file. Its angles are in radians, and its positions of sliding joints in metres.
@@ -165,7 +166,9 @@ def read_foreign(
     Raises:
         ModelFileError: the file is missing or malformed, or names another hand, or a root link that
             the hand does not have.
-        ModelFileError: joints fit only with another sign, or do not follow as the hand's joints do.
+        ModelFileError: a joint is beyond its limits, and within them with the opposite sign.
+        ModelFileError: coupled joints do not follow as in the hand, and move a fingertip by over
+            0.1 mm.
         BadArgument: the `order` misses an actuated joint, has a name twice, or has a factor that is
             0 or no number.
 

@@ -117,9 +117,11 @@ def save_play(
         parts: convex parts [m] of the mesh; None means that `convex_parts` computes them.
 
     Raises:
-        BadArgument: there are no grasps, grasps failed a check, joints are of another hand, or the
-            grasps do not touch the mesh.
+        BadArgument: there are no grasps, or grasps failed a check.
+        BadArgument: joints are of another hand, or the grasps do not touch the mesh.
         BadArgument: the planned table has an edge, and the player is not "mujoco".
+        BadArgument: the player is "isaaclab" or "usd", and a link or joint of the hand has a name
+            that USD forbids.
         MeshError: the mesh is open or malformed.
         OutputError: a file cannot be written.
 
@@ -246,10 +248,10 @@ def pressing_force(spec: TrialSpec, mass: Positive) -> float:
     """Return the normal force [N] with which the strongest finger presses in a folder of
     `save_play`.
 
-    It is `spec.force`. If that is None, two opposite fingers hold the weight of a `mass` [kg] and a
-    push of 2.5 N (`PUSH`). They do so with half of the mean friction coefficient, which counts as
-    at least 0.1 (`PLAY.friction`). This force is at most `spec.max_force`, and at most 100 N
-    (`PLAY.force`).
+    It is `spec.force`. If `spec.force` is None, two opposite fingers hold two loads: the weight of
+    a `mass` [kg] and a push of 2.5 N (`PUSH`). They do so with half of the mean friction
+    coefficient, which counts as at least 0.1 (`PLAY.friction`). This force is at most
+    `spec.max_force`, and at most 100 N (`PLAY.force`).
 
     >>> round(pressing_force(TrialSpec(friction=0.8), 0.25), 1)
     6.2

@@ -52,8 +52,9 @@ class FingerAbility:
             joint moves the contact point along its normal in these postures.
 
     Both forces act at the contact point of the pad, the part that touches objects, along the pad's
-    normal. No other finger presses, and each actuated joint exerts at most its effort. A posture is
-    free if no links of the hand overlap.
+    normal. No other finger presses, and each actuated joint exerts at most its effort, its greatest
+    torque in the URDF. An effort that the URDF lacks counts as 0, and so gives a force of 0. A
+    posture is free if no links of the hand overlap.
     """
 
     name: str

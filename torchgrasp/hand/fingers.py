@@ -43,8 +43,9 @@ class ActuatedJoints(Value):
 
     Attributes:
         names: names of the h actuated joints, in the order of every tensor of joints.
-        lower: lower limits (h,) [rad, or m for a sliding joint].
-        upper: upper limits (h,) [rad or m].
+        lower: lower limits (h,) [rad, or m for a sliding joint]: those of the URDF plus the
+            `limit_margin` in hand.toml.
+        upper: upper limits (h,) [rad or m]: those of the URDF minus this margin.
         coupling: matrix (j, h): the motion of each movable joint for a unit motion of each actuated
             joint. It has no unit between joints of one kind. It is [m/rad] for a sliding joint that
             follows a turning one, and [rad/m] in the opposite case.

@@ -34,8 +34,8 @@ class Actuator(NamedTuple):
     A sliding joint has [N] and [m] in place of [N m] and [rad].
 
     Attributes:
-        effort: greatest torque [N m].
-        velocity: greatest speed [rad/s].
+        effort: greatest torque [N m]; 0 if the URDF gives none.
+        velocity: greatest speed [rad/s]; 0 if the URDF gives none.
         kp: stiffness of the position control [N m/rad].
         kd: damping of the position control [N m s/rad].
 

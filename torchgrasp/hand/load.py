@@ -89,8 +89,9 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
             - a tuple of the names of three to five fingers, or a text with commas:
               "index,middle,thumb".
 
-    An option may park joints of the other fingers at given positions. Other joints that do not
-    grasp stay at zero, or at the limit nearest to zero.
+    An option gives a fixed position to each joint that neither grasps nor follows another joint.
+    Fingers chosen by their names may leave joints without such a position. These joints stay at
+    zero, or at the limit nearest to zero.
 
     Raises:
         HandFileError: a file is missing or malformed, or the two files contradict each other.

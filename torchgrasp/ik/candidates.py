@@ -81,8 +81,8 @@ class GraspProblem(Value):
         descends: whether the opened hand may start above the pose of the grasp. It does so if its
             opened fingers would be in the table (`opened_pose`). It then goes down while it closes.
 
-    Raises `BadArgument` if the contacts lack `std_m`, or for a `center` more than 2 m
-    (`FARTHEST_CENTER`) from the contacts.
+    Raises `BadArgument` if the contacts lack `std_m`. On the CPU it is also raised for a `center`
+    more than 2 m (`FARTHEST_CENTER`) from the contacts' centroid.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -303,9 +303,9 @@ def solve_joint(
     """Return the best checked grasp for each contact set that has initial guesses; contacts may
     move with the hand.
 
-    The guesses of a set are tried in their order, first with fixed contacts. If the hand cannot
-    reach the contacts, posture and contacts are solved for together. The contacts then slide along
-    the surface of the `shape`. The moved contacts are checked for force closure again (`certify`).
+    The first two guesses of a set are tried, at first with fixed contacts. If both grasps fail a
+    check, posture and contacts are solved for together. The contacts then slide along the surface
+    of the `shape`. The moved contacts are checked for force closure again (`certify`).
     If they violate a constraint on contacts, the grasp has the `Status` of this constraint, as in
     `ContactPlan`.
 
@@ -316,7 +316,8 @@ def solve_joint(
 
     Args:
         problem: hand, b contact sets and surroundings.
-        seeds: initial guesses, from `nearest_postures`.
+        seeds: initial guesses, from `nearest_postures`. Those that an arm cannot reach
+            (`GraspProblem.reachable`) are left out.
         shape: the object's shape, from `fit_shape`, in the frame of the contacts.
         spec: constraints on sliding contacts, such as friction and table.
 

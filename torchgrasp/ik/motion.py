@@ -100,9 +100,10 @@ def opened_pose(
 ) -> Float[Tensor, "g 4 4"]:
     """Return the poses (g, 4, 4) [m] at which g opened hands end their approach and begin to close.
 
-    Such a pose is that of the grasp. It is raised along the table's normal if an opened link would
-    be in the table. The reason is that coupled fingers can move towards the table as they open. A
-    hand that would have to rise by more than 30 mm (`MOTION.most`) is not raised.
+    The pose is that of the grasp, unless an opened link would be in the table: coupled fingers can
+    move towards the table as they open. Then the pose is raised along the table's normal, until the
+    links are 1 mm (`MOTION.gap`) above the table. A hand that would have to rise by more than 30 mm
+    (`MOTION.most`) is not raised.
 
     Args:
         hand: the hand.

@@ -96,9 +96,9 @@ class PostureLibrary(Value):
         vf_from_hand: pose (s, 4, 4) [m] of the hand's root link in the frame vf.
         centres: centres (s, f, 3) [m] of the fingertips, in the frame vf.
         feature: numbers (s, 6 f) without unit by which postures are compared. Each fingertip has
-            six: its centre divided by 10 mm (`SEEDS.length_scale`), then the axis of its pad
-            divided by 0.5 (`SEEDS.cosine_scale`). The pad is the part that touches objects. Both
-            are in the frame vf.
+            six: its centre divided by 10 mm (`SEEDS.length_scale`), then the outward unit normal of
+            its pad divided by 0.5 (`SEEDS.cosine_scale`). The pad is the part that touches objects.
+            Both are in the frame vf.
         spheres: centres (s, k, 3) [m] of the collision spheres, in the frame of the hand's root
             link.
 
@@ -232,14 +232,15 @@ def nearest_postures(
         n_seeds: most guesses of a contact set, 1 to 64.
         reachable: function of hand poses (k, 4, 4) [m] in the frame of the contacts. It returns a
             mask (k,) of the poses that an arm reaches. The next posture takes the place of an
-            unreachable one. None means that every pose is reachable.
+            unreachable one. At most 3 `n_seeds` postures (`SEEDS.spare`) of a contact set are
+            tried. None means that every pose is reachable.
 
     Raises:
         BadArgument: `n_seeds` outside [1, 64], or above six times the number of postures in the
             library.
         BadArgument: contacts on another device than the library, or of another number than
             fingertips.
-        BadArgument: normals that are not of length 1 (to 1e-3).
+        BadArgument: normals that are not of length 1 (to 1e-3), if they are on the CPU.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -107,8 +107,9 @@ def solve_ik(
     """Return for each contact set the best hand configuration whose fingertips touch its contacts.
 
     Any finger may touch any contact. `Status.OK` means that no link collides, and every tip is
-    within 1 mm of its contact. Every contact's inward normal is then in the cone of the finger's
-    pad (`Fingertips.cone`). The pad is the part that touches objects.
+    within 1 mm of its contact. Joints are then within their limits. Every contact's inward normal
+    is then in the cone of the finger's pad (`Fingertips.cone`), to 2 degrees. The pad is the part
+    that touches objects.
 
     Args:
         hand: the hand.

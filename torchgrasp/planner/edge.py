@@ -46,10 +46,12 @@ class EdgePlan(Value):
         grasps: grasps of the object after the drag; without a drag, of the object where it stands.
             They are in the frame of the cloud, the best first, as those of `plan_grasps`. Their
             metadata hold the drag (`torchgrasp.planner.drag_of`), so that one file has both.
-        shape: the estimated shape after the drag, in the same frame.
+        shape: the estimated shape after the drag, in the same frame; without a drag, where the
+            object stands.
         reason: why there is no drag, as a sentence; "" if there is one. Reasons are: the object
             already hangs over the edge far enough; it is too heavy; no posture of the hand can
-            press on it; a neighbour is in its way; the edge is too far outside what the camera saw.
+            press on it; a neighbour is in its way; in a scene, the drag would be longer than 0.25 m
+            (`OCCUPANCY.sideways`).
     """
 
     drag: DragPlan | None
@@ -61,9 +63,9 @@ class EdgePlan(Value):
     def success(self) -> float:
         """The predicted success, in [0, 1], of the drag and the first grasp together.
 
-        It is that of the grasp, times 0.85 if there is a drag (`DRAG.ended`). So many simulated
-        drags ended as planned. The result is 0 without an executable grasp, one that passed all
-        checks. It is NaN if the grasp's success is unknown.
+        It is that of the grasp, times 0.85 if there is a drag (`DRAG.ended`). This factor is the
+        share of simulated drags that ended as planned. The result is 0 without an executable grasp,
+        one that passed all checks. It is NaN if the grasp's success is unknown.
         """
         good = self.grasps.executable
         if not len(good):
@@ -100,7 +102,8 @@ def plan_edge_grasps(
         task: what grasps must do; None means `GraspTask()`. If its mass is a distribution, the drag
             is planned for the greatest mass.
         table_friction: coefficient of friction between object and table. The pressing force is
-            three times (`DRAG.reserve`) the least one that moves the object (Coulomb's law).
+            three times (`DRAG.reserve`) the least one that moves the object (Coulomb's law). It is
+            at least twice the weight and 1 N, but at most 20 N.
 
     Raises:
         BadArgument: a table without an edge; or an edge more than 15 mm (`DRAG.behind`) behind the

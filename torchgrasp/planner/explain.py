@@ -200,7 +200,7 @@ class Explanation(Value):
 
     Attributes:
         starts: number of initial guesses of each plan, the plan without a change and those with
-            one.
+            one. A plan whose change is more guesses has the number that its `words` name.
         funnel: how many candidates each planning stage lost, and why, without a change. Its field
             `stages` has an entry for "contacts", "postures" and "grasps", in this order. An entry
             has the name `stage` and the word `things` for its candidates. `given` is how many
@@ -240,8 +240,9 @@ class Explanation(Value):
 
         It names the most helpful change. The user may be unable to make this change, such as a
         higher friction. Then the sentence also names the most helpful change among those that the
-        user can make. If no change helps, the sentence names the stage that loses most candidates,
-        and the reason. If there is a grasp after all, it says so.
+        user can make. If no change helps, it tells of the stage that loses most candidates: the
+        word for the candidates (`things`), and the reason. If there is a grasp after all, it says
+        so.
         """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
@@ -292,29 +293,30 @@ def explain_empty(
     changes are:
 
     * no `keep`, `avoid` or `resist`;
-    * other fingers, or another shipped hand;
+    * other fingers, another shipped hand, or the `mode` "joint";
     * wider limits of contacts, or a higher friction;
-    * no table, or another one;
+    * no table, or a table at the lowest point if none was given;
     * no neighbours, or neighbours that may be pushed;
     * an arm that reaches every pose.
 
     The search ends at a change that the user can make and that gives grasps with a high predicted
     success. If a grasp is found without a change, no change is tried.
 
-    The work is bounded by numbers (`EXPLAIN`), not by time, so a seed always gives the same
+    Without a `time_budget`, numbers bound the work (`EXPLAIN`), so a seed always gives the same
     explanation:
 
     * A plan has at most 20 initial guesses, and a library of 500 postures.
-    * Relaxed constraints are tried only if no contact set is found.
+    * If no contact set is found, the most relaxed constraints are tried, too.
     * At most 8 changes are tried, fewer with "auto" fingers. First come those that could prevent
       the most losses.
-    * If no change helps and `starts` is at most 80, four times as many guesses are tried.
+    * If no change helps and `starts` is at most 80, a last plan has four times `starts` guesses.
 
     Args:
         cloud: the cloud or scene, as in `plan_grasps`.
         hand: the hand, as in `plan_grasps`.
         spec: the constraints on contacts, as in `plan_grasps`.
-        starts: number of random initial guesses, as in `plan_grasps`.
+        starts: number of random initial guesses. At most 20 are used, except in the last plan
+            described above.
         seed: random seed.
         fingers, task, promise, reachable, arm, keep, avoid, resist, mode, ranking, shape: as in
             `plan_grasps`.

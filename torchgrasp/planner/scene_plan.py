@@ -141,6 +141,9 @@ def plan_scene(
         CloudFileError: a file of a scene that is missing or malformed.
         HandFileError: there is no such hand, or its files are malformed.
 
+    If `plan_grasps` raises a `GraspError` for an object, `plan_scene` does not raise it: the
+    `reason` of the object's plan is its text.
+
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=12, enough=0.5)
     >>> plan.best.success > 0.5, plan.things[-1].reason

@@ -84,10 +84,10 @@ class SampleFolder:
         return self.n
 
     def __getitem__(self, i: int) -> tuple[Tensor, Tensor]:
-        """Return the joints (h,) [rad] and the contact code (6,) of posture i.
+        """Return the joints (h,) [rad or m] and the contact code (6,) of posture i.
 
-        Raises `IndexError` beyond the last posture, and `ModelFileError` for a missing or damaged
-        chunk.
+        A negative i counts from the end. Raises `IndexError` beyond the last posture, and
+        `ModelFileError` for a missing or damaged chunk.
         """
         chunk, row = divmod(range(self.n)[operator.index(i)], CHUNK_POSTURES)
         samples = self.recent.get(chunk, self.chunk)

@@ -117,7 +117,8 @@ class HandSamples(Batch):
         joints: positions (n, h) [rad or m] of the h actuated joints.
         q: contact codes (n, q) of the f fingertips (`encode`). First come their f distances [m]
             from the centroid, then the cosines between all pairs of normals. So q is 6 for three
-            fingers, 10 for four and 15 for five.
+            fingers, 10 for four and 15 for five. With the sampling "uniform" they are of the pads'
+            contact points. With "grasping" they are of the random contacts on the pads.
         joint_names: names of the h joints, in the order of the columns of `joints`.
         meta: texts that describe hand, seed and sampling.
 

@@ -190,8 +190,8 @@ def fit_mixture(
         BadArgument: a joint that does not vary, a number out of range, or another fit's checkpoint.
         ModelFileError: a damaged checkpoint.
         OutputError: a checkpoint that cannot be written.
-        IndefiniteCovariance: a component collapses more than three times: its covariance becomes
-            singular, or it has too few samples.
+        IndefiniteCovariance: a component collapses more than three times, or all collapse in one
+            step. It collapses if its covariance is singular, or it has too few samples.
 
     >>> import torch
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))

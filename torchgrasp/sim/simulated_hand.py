@@ -126,7 +126,8 @@ class SimulatedHand:
             targets: targets of all movable joints of the URDF and of the palm, as
                 `GraspController.step` returns them.
 
-        Raises `BadArgument` unless the targets have all joints of the URDF.
+        Raises `BadArgument` unless the targets have all joints of the URDF. Raises it also for a
+        displaced palm if the scene's mount cannot shift (`SceneSpec.yields`).
         """
         if len(targets.joints) != len(self._to_scene):
             allowed = f"all {len(self._to_scene)} of the URDF"

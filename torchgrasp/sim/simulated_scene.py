@@ -35,7 +35,8 @@ class StepContacts:
         weight: sum (f,) [N s] of these weights.
         finger: mask (f,) of the fingers that touch the object, with the fingertip or with the link
             that carries it.
-        force: force (f, 3) [N] of each fingertip on the object, with friction.
+        force: force (f, 3) [N] of each fingertip on the object, with friction. SAPIEN measures it
+            at the joint that carries the fingertip, and gives 0 without a contact.
         stray: sums (3,) [N s] of the sizes of the hand's unintended normal impulses: on neighbours,
             on the table, on the object. On the object, those of fingertips and the links that carry
             them do not count.

@@ -89,8 +89,9 @@ def explain_success(
     lifted object, the `log_odds` of "load" are greater (`lost_by_weakness`). Causes that do not
     lower the success are left out.
 
-    If no trial has tested some of the task's frictions and masses, "task" is always among the
-    causes. Its sentence then says for what share of them the success is unknown.
+    If trials have tested some of the task's frictions and masses, but not all, "task" is always
+    among the causes. Its `log_odds` may then be negative. Its sentence says what share of the
+    frictions and masses no trial has tested.
 
     Args:
         grasps: grasps of `plan_grasps`, of which the first counts.
@@ -99,8 +100,8 @@ def explain_success(
         task: what the grasp must do; None means `GraspTask()`.
 
     Raises `BadArgument` for no grasps, or grasps of another planner. It is raised for a hand or
-    fingers that the grasps do not name. It is also raised for a shape whose surface is more than
-    20 mm (`SLACK`) from half of the contacts, as in another frame.
+    fingers that the grasps do not name. It is also raised for a shape in another frame: its surface
+    is more than 20 mm (`SLACK`) from half of the contacts.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -39,8 +39,8 @@ class GraspTask(Value):
             "open_loop": without sensors, from pre-grasp to grasp to squeeze. The squeeze is joint
               targets with which the fingers press.
         displaced: whether the object may have moved since the camera saw it. In a lift it may have
-            moved by up to 30 mm along the table. In pulls it may have moved by up to 5 mm and 5
-            degrees.
+            moved by up to 30 mm along each of two axes of the table. In pulls it may have moved by
+            up to 5 mm along, and 5 degrees about, each of three axes.
 
     Raises `BadArgument` for a number outside its range, or a lift in open loop.
 

@@ -214,8 +214,8 @@ class ContactPlan(Batch):
         coefficients: weights phi (b, f, e) of forces along the edges of the friction cones, without
             unit (Eq. 13 of the paper). The weights of a set have the sum 1, over all its fingertips
             and edges. If the set has force closure, these forces balance.
-        quality: distance (b,) [m] of the contacts' centroid from the cloud's centre (Eq. 14); less
-            is better.
+        quality: distance (b,) [m] of the contacts' centroid from the origin of the normalised
+            frame, `ShapeGP.center` (Eq. 14); less is better.
         status: `Status` code (b,) of each set: `OK`, or the first constraint that the set violates.
     """
 
@@ -239,8 +239,8 @@ class Certificate(Batch):
 
     Attributes:
         closed: mask (b,) of the sets that have force closure. Their margin is at least 1e-6 and
-            their `rank_ratio` at least 1e-3: coincident or collinear contacts satisfy Eq. (13),
-            too.
+            their `rank_ratio` at least 1e-3. Their contacts do not lie almost on a line:
+            coincident or collinear contacts satisfy Eq. (13), too.
         margin: the largest s (b,) for which coefficients phi >= s have W phi = 0 and sum phi = 1.
             It is -inf if no coefficients balance, and NaN for contacts that are not finite.
         rank_ratio: the smallest singular value of W over its largest one (b,).
@@ -250,7 +250,7 @@ class Certificate(Batch):
             margin is at most 0, v . w >= 0 for every edge wrench w, up to rounding. So no contact
             force opposes v. For a set with force closure, v proves that no greater margin is
             possible. The margin is -min(v . w) / sum(v . w - min(v . w)) over the edge wrenches. If
-            only the rank is too low, the wrenches are smallest along v.
+            the margin suffices, but the set is not closed, the wrenches are smallest along v.
         task_load: the load t (b, 6) that the contacts resist least, of the loads in the argument
             `resist` of `plan_grasps`. It is a force [N], then a torque [N m] about the contacts'
             centroid, in the frame of the cloud.
@@ -391,14 +391,17 @@ class Grasps(Batch):
             contact set of grasp k.
         tip_error: distance (g, f) [m] of each fingertip from its contact.
         clearance: least distance (g,) [m] of the links from the estimated surface, from each other
-            and from the table. It is negative where they overlap. Fingertips may touch the surface.
+            and from the table. In a scene it is also from obstacles that links must not touch. It
+            is negative where they overlap. Fingertips may touch the surface.
         normal_angle: angle (g, f) [rad] between the axis of a fingertip's pad and the inward normal
             of the object at its contact. The pad is the part that touches objects.
         certificate: proof of force closure (g rows): whether the contacts resist any load.
         score: log-odds (g,) of the predicted success p, log(p / (1 - p)) without unit. Executable
-            grasps are in the order of their scores, unless the argument `ranking` of `plan_grasps`
-            is "variance". The score of a failed grasp is no log-odds and says nothing about
-            success.
+            grasps of `plan_grasps` with a `known` success come first, then the other executable
+            ones. Both are in falling order of their scores. With an arm, grasps of equal success in
+            whole per cent are in falling order of the product of `ease`. With the argument
+            `ranking` "variance", scores do not count. The score of a failed grasp is no log-odds
+            and says nothing about success.
         status: `Status` code (g,): `OK` for an executable grasp, which passed all checks. Else it
             is the reason why the grasp failed.
         meta: names, units, hashes and the seed of the plan, as text.
@@ -408,7 +411,8 @@ class Grasps(Batch):
             grasps with this predicted success. It comes from trials, by resampling families of
             objects. [0, 1] if the success is unknown, [0, 0] for failed grasps. None if there are
             no bounds.
-        arm: joints (g, n) [rad or m] of the arm at the grasp; None without an arm.
+        arm: joints (g, n) [rad or m] of the arm at the grasp, 0 for failed grasps; None without an
+            arm.
         ease: two numbers (g, 2) for the arm's straight path to the grasp. Column 0 is the least
             distance of a joint from its limits, divided by half its range (no unit). Column 1 is
             the least manipulability, sqrt(det(J J^T)) [m^3]. 0 for failed grasps; None without an
