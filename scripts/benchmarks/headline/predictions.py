@@ -6,7 +6,7 @@ and some that follow are pulled at by protocol "dexgraspbench".
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import torch
@@ -29,9 +29,13 @@ from torchgrasp.success.promise import find_promise
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.specs import ContactSpec
 
+HAND = "allegro"
+SIMULATOR = "mujoco"
 FRICTIONS = (0.3, 0.6, 0.8)
 MASSES = (0.05, 0.1, 0.25)
-"""Coefficients of friction, and masses [kg] that take turns with them."""
+"""Hand and simulator of all trials; coefficients of friction, and masses [kg] that take turns with
+them.
+"""
 BEST = 20
 OTHERS = 4
 """Best grasps that are tried of each plan, and grasps tried of those that follow."""
@@ -83,19 +87,8 @@ def table_spec(o: Options, representatives: bool) -> TableSpec:
 def pulls(o: Options) -> list[Row]:
     """Pull at grasps of the Allegro hand, each object at one friction and mass: they take turns."""
     spec = table_spec(dataclasses.replace(o, names=o.names or LEFT_OUT), representatives=False)
-    tasks = [
-        (spec, x, "allegro", FRICTIONS[k % 3], MASSES[k // 3 % 3], "mujoco")
-        for k, x in enumerate(subjects(spec))
-    ]
-    return judge_tasks(tasks, o.workers)
-
-
-def judge_tasks(tasks: Sequence[tuple[Any, ...]], workers: int) -> list[Row]:
-    """Run tasks in several processes, and return the rows of results of all of them.
-
-    A task holds the arguments of `try_object`.
-    """
-    cells = [Cell(*found) for found in run_all(try_object, tasks, workers, CELL_SECONDS)]
+    tasks = [(spec, x, FRICTIONS[k % 3], MASSES[k // 3 % 3]) for k, x in enumerate(subjects(spec))]
+    cells = [Cell(*found) for found in run_all(try_object, tasks, o.workers, CELL_SECONDS)]
     planned = [cell for cell in cells if cell.tried]
     rows = [Row("views with an executable grasp", "-", f"{len(planned)} of {len(cells)}")]
     if planned:
@@ -103,23 +96,21 @@ def judge_tasks(tasks: Sequence[tuple[Any, ...]], workers: int) -> list[Row]:
     return rows
 
 
-def try_object(
-    spec: TableSpec, subject: Subject, hand: str, friction: float, mass: float, simulator: str
-) -> tuple[Any, ...]:
+def try_object(spec: TableSpec, subject: Subject, friction: float, mass: float) -> tuple[Any, ...]:
     """Plan on the first view of an object, and pull at grasps of its plan; return the fields of a
     `Cell`.
 
     A result that an earlier call kept in a file is read.
     """
-    about = (subject.label, subject.family, subject.group, hand, friction, mass)
-    asked = friction, mass, simulator, sha256(MODEL)[:12]
-    path = spec.kept("success", f"{hand}_{subject.label}", *asked).with_suffix(".json")
-    executable, tried = keep(path, lambda: pull_at(spec, subject, hand, friction, mass, simulator))
+    about = (subject.label, subject.family, subject.group, HAND, friction, mass)
+    asked = friction, mass, SIMULATOR, sha256(MODEL)[:12]
+    path = spec.kept("success", f"{HAND}_{subject.label}", *asked).with_suffix(".json")
+    executable, tried = keep(path, lambda: pull_at(spec, subject, friction, mass))
     return *about, executable, tried
 
 
 def pull_at(
-    spec: TableSpec, subject: Subject, hand: str, friction: float, mass: float, simulator: str
+    spec: TableSpec, subject: Subject, friction: float, mass: float
 ) -> tuple[int, list[tuple[int, float, bool]]]:
     """Plan on the first view of an object and pull at its grasps; return (executable, tried).
 
@@ -127,10 +118,10 @@ def pull_at(
     success, passed) of each trial: of the 20 best grasps, and of some that follow.
     """
     base = PROTOCOLS["dexgraspbench"]
-    model = load_hand(hand)
+    model = load_hand(HAND)
     solid = read_solid(subject)
     patch = base.trial.patch * Distribution.of(base.trial.friction).mean / friction
-    protocol = base.with_trial(friction=friction, mass=mass, patch=patch, simulator=simulator)
+    protocol = base.with_trial(friction=friction, mass=mass, patch=patch, simulator=SIMULATOR)
     contacts = ContactSpec(friction, table=Plane.horizontal(0.0))
     cloud = next(iter(solid.views.values()))
     grasps = plan_grasps(cloud, model, contacts, spec.starts, spec.seed, task=protocol.task)
