@@ -12,6 +12,7 @@ import torch
 import trimesh
 import tyro
 from benchmarks.scene.scenes import scatter
+from sklearn.linear_model import LogisticRegression
 
 from torchgrasp import Scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
@@ -53,8 +54,7 @@ KEPT = 1500
 SEEN = 400
 """Least number of pixels of a target."""
 DAMPING = 3.0
-STEPS = 30
-"""Weight of the squares of the values in the regression; steps of Newton's method."""
+"""Weight of the squares of the values in the regression."""
 BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 """Bins of the reliability."""
 
@@ -154,17 +154,12 @@ def fit(
         np.stack([np.interp(x, k, e) for e in np.eye(len(k))], 1)
         for x, k in zip(features.T, knots, strict=True)
     ]
-    design = np.concatenate([*hats, np.ones((len(full), 1))], 1)
-    weights = np.zeros(design.shape[1])
-    damping = np.r_[np.full(design.shape[1] - 1, DAMPING), 0.0]
-    for _ in range(STEPS):
-        p = 1 / (1 + np.exp(-design @ weights))
-        gradient = design.T @ (p - full) + damping * weights
-        curvature = (design * (p * (1 - p))[:, None]).T @ design + np.diag(damping + 1e-6)
-        weights -= np.linalg.solve(curvature, gradient)
-    split = np.split(np.round(weights[:-1], 3), np.cumsum([len(k) for k in knots])[:-1])
+    regression = LogisticRegression(C=1 / DAMPING, solver="newton-cholesky", tol=1e-9)
+    fitted = regression.fit(np.concatenate(hats, 1), full)
+    weights = np.round(fitted.coef_[0], 3)
+    split = np.split(weights, np.cumsum([len(k) for k in knots])[:-1])
     values = [v.tolist() for v in split]
-    return {"bias": round(float(weights[-1]), 3), "knots": knots, "values": values}
+    return {"bias": round(float(fitted.intercept_[0]), 3), "knots": knots, "values": values}
 
 
 def reliability(p: np.ndarray, full: np.ndarray) -> list[str]:
