@@ -54,12 +54,9 @@ def sum_by(values: Iterable[tuple[str, float]]) -> dict[str, tuple[float, int]]:
     return sums
 
 
-def format_number(share: Share, sign: str = "+") -> str:
-    """Return a mean or a difference with its interval as text: "value [low, high]".
-
-    `sign` is the sign's option of a format; "+" shows the sign of positive numbers, too.
-    """
-    return f"{share.value:{sign}.3f} [{share.low:{sign}.3f}, {share.high:{sign}.3f}]"
+def format_number(share: Share) -> str:
+    """Return a mean or a difference with its interval as text: "value [low, high]", with signs."""
+    return f"{share.value:+.3f} [{share.low:+.3f}, {share.high:+.3f}]"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,12 +184,6 @@ def measure(subject: str, options: Options) -> list[Row]:
         found += rows
     met, missed = (sum(row.met is verdict for row in found) for verdict in (True, False))
     print(f"{met} targets met, {missed} missed, {len(found) - met - missed} rows without a target")
-    content = {
-        "bench": subject,
-        "settings": dataclasses.asdict(options),
-        "rows": list(map(dataclasses.asdict, found)),
-    }
-    write_file(options.out / f"bench_{subject}.json", json.dumps(content, indent=1, default=str))
     return found
 
 

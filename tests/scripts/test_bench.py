@@ -50,7 +50,7 @@ def test_bench_writes_its_rows(name, tin, tmp_path, monkeypatch, few_postures, k
     )
     rows = measure(subject, options)
     assert len(rows) > 0
-    written = json.loads((tmp_path / "out" / f"bench_{subject}.json").read_text())
+    written = json.loads((tmp_path / "out" / "rows" / f"{subject}-{short}.json").read_text())
     assert [row["what"] for row in written["rows"]] == [row.what for row in rows]
     table = (tmp_path / "out" / f"{subject}-{short}.md").read_text()
     assert "Commit " in table and table.count("\n| ") == len(rows) + 2

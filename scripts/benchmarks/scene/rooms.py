@@ -22,7 +22,8 @@ from torchgrasp.geometry.plane import Plane
 CAMERAS: tuple[SensorName, ...] = ("realsense", "kinect_v1", "azure", "zivid")
 """Cameras that take the pictures, in turn."""
 CLEARANCE = 3
-"""Pixels between a lone thing and every other thing in the picture."""
+LEAST = 400
+"""Pixels between a lone thing and every other thing in the picture; least measured pixels of it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,11 +52,11 @@ class Room:
         """The table's plane in the camera's frame."""
         return self.table.moved(torch.linalg.inv(self.camera_pose))
 
-    def lone(self, least: int = 400) -> tuple[int, ...]:
+    def lone(self) -> tuple[int, ...]:
         """Return the labels of things that stand alone in the picture.
 
-        Such a thing does not reach the picture's rim, and has no other thing beside it. It has at
-        least `least` measured pixels.
+        Such a thing does not reach the picture's rim, and has no other thing beside it. It has
+        enough measured pixels.
         """
         from scipy.ndimage import binary_dilation
 
@@ -65,11 +66,8 @@ class Room:
             about = torch.from_numpy(binary_dilation(mine.numpy(), iterations=CLEARANCE))
             cut = mine[:2].any() | mine[-2:].any() | mine[:, :2].any() | mine[:, -2:].any()
             others = about & (self.labels > 0) & ~mine
-            if (
-                int((mine & (self.depth > 0)).sum()) >= least
-                and not bool(cut)
-                and not bool(others.any())
-            ):
+            measured = int((mine & (self.depth > 0)).sum())
+            if measured >= LEAST and not bool(cut) and not bool(others.any()):
                 found.append(k)
         return tuple(found)
 
