@@ -4,6 +4,7 @@ starts.
 
 import dataclasses
 import itertools
+import math
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from torchgrasp.contacts.plan import TO_CENTRE, plan_chunk, plan_contacts
 from torchgrasp.contacts.problem import ContactProblem
 from torchgrasp.contacts.starts import (
     STARTS_PER_CHUNK,
+    FlatCandidates,
     candidate_rows,
     draw_in,
     drawn_starts,
@@ -185,7 +187,7 @@ def test_contacts_of_a_ball_are_flat_within_the_widest_ring_that_it_offers(ellip
     assert torch.equal(plan.contacts.points, there.contacts.points)
     given = dataclasses.replace(spec, flat_radius=0.002)
     assert settle_flatness(ball, given, 0).spec == given
-    assert settle_flatness(ball, ContactSpec.paper(), 0) == (ContactSpec.paper(), None)
+    assert settle_flatness(ball, ContactSpec.paper(), 0) == (ContactSpec.paper(), None, None)
 
 
 @pytest.mark.parametrize("fingertips", [3, 4])
@@ -200,7 +202,7 @@ def test_starts_are_the_first_good_ones_of_all_that_are_drawn(ellipsoid, monkeyp
         monkeypatch.setattr("torchgrasp.contacts.starts.LEAST_PORTION", portion)
         far = dataclasses.replace(problem, separation=apart)
         generator = torch.Generator().manual_seed(2)
-        rows = candidate_rows(far, points, normals, 12, generator)
+        rows = candidate_rows(far, [settled.candidates], 12, generator)
         # the generator goes on from the same state
         return torch.cat([rows.flatten(), torch.rand(2, generator=generator).double()])
 
@@ -216,6 +218,35 @@ def test_starts_are_the_first_good_ones_of_all_that_are_drawn(ellipsoid, monkeyp
     assert len(wanted) >= 5
     first = points[wanted].flatten()
     assert torch.equal(drawn(1, problem.separation)[: len(first)], first)
+
+
+def test_starts_of_a_low_thing_on_a_table_are_drawn_where_a_contact_can_push_level(ellipsoid):
+    """A cap of 9 mm on a table: nearly all candidates lie on its top, where none can push level."""
+    low = dataclasses.replace(ellipsoid, axes=(1.0, 0.5, 0.15), doubt=0.0)
+    foot = low.center[2] - low.scale * low.axes[2]
+    spec = ContactSpec(table=foot, friction=0.8, friction_margin=0.75, flat_radius=0.001)
+    settled = settle_flatness(low, spec, 0)
+    assert settled.level is not None
+    points, normals = settled.level
+    assert float(low.value(points).abs().max()) < 1e-4
+    assert float(normals[:, 2].max()) < math.sin(math.atan(0.6) + math.radians(5))
+    tips = low.metres(points) + spec.fingertip_radius * normals
+    assert float(tips[:, 2].min()) > foot + spec.fingertip_radius
+
+    def share_closed(candidates: FlatCandidates) -> float:
+        first = next(drawn_starts(low, candidates, [200], 0))
+        problem = ContactProblem.of(low, spec)
+        _, gradient = low.mean_and_gradient(first.flatten(0, 1))
+        closed = closed_exact(first, unit(gradient).view_as(first), problem.friction)
+        return float(closed.double().mean())
+
+    assert share_closed(settled._replace(level=None)) < 0.05
+    assert share_closed(settled) > 0.5
+    plan = plan_contacts(low, spec, starts=200)
+    good = plan[plan.status == Status.OK]
+    assert len(good) > 100 and bool(certify(good.contacts, spec).closed.all())
+    high = dataclasses.replace(low, axes=(1.0, 0.6, 0.5))
+    assert settle_flatness(high, ContactSpec(table=foot - 0.021), 0).level is None
 
 
 def test_contacts_on_opposite_sides_of_a_thin_thing_may_be_as_near_as_it_is_thin(ellipsoid):

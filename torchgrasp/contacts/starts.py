@@ -6,7 +6,8 @@ f counts the contacts of a set.
 
 import dataclasses
 import itertools
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,6 +20,7 @@ from torchgrasp.contacts.form_closure import Vectors, closed_exact
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, device_of, variance_at, walls_of
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import Points, norm, unit
+from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.specs import FLAT_RADII, ContactSpec
 
 CANDIDATE_TRIPLES = 350  # triples of surface points among which candidates are found
@@ -35,6 +37,11 @@ LEAST_PORTION = 4000  # sets judged at once: a few take as long, as each operati
 # share of starts, and of how many, that must be closed: contacts can be so flat
 ENOUGH_CLOSED = 0.1
 SURVEYED = 250
+# of points about which closed sets are rare, so many times more are drawn
+LEVEL_SURVEY = 8
+# largest angle [deg] by which a level candidate's normal may rise beyond the half angle of the
+# friction cone: with one that rises less, a contact can push up or along the table
+LEVEL = 5.0
 # starts planned at once: memory is bounded, and a plan from fewer starts begins one from more
 STARTS_PER_CHUNK = 500
 
@@ -83,16 +90,33 @@ def start_chunks(starts: int) -> list[int]:
     return [min(STARTS_PER_CHUNK, starts - begin) for begin in range(0, starts, STARTS_PER_CHUNK)]
 
 
+class SurfacePoints(NamedTuple):
+    """Normalised points (p, 3) on a surface, and the outward unit normals (p, 3) there."""
+
+    points: Points
+    normals: Points
+
+
 class FlatCandidates(NamedTuple):
-    """Constraints with a known `flat_radius`, and p candidate contacts where the surface is flat.
+    """Constraints with a known `flat_radius`, and candidate contacts where the surface is flat.
 
     The `flat_radius` [m] is the radius around a contact within which it must be flat. `spec` holds
-    the constraints. `candidates` are the normalised points (p, 3), and the outward unit normals (p,
-    3) there. They are None if the surface need not be flat.
+    the constraints. The `candidates` are None if the surface need not be flat.
+
+    `level` are further candidates, for a low object on a table. Its contacts must be high, as a
+    fingertip is above the table. Most of them lie on its top, and few sets of them have force
+    closure. The normals of level candidates rise so little that a contact can push up or along the
+    table. They are None where sets with force closure are not rare.
     """
 
     spec: ContactSpec
-    candidates: tuple[Points, Points] | None  # None: no flatness
+    candidates: SurfacePoints | None
+    level: SurfacePoints | None = None
+
+    @property
+    def groups(self) -> list[SurfacePoints]:
+        """The candidates, then the level ones, without those that are None."""
+        return [group for group in (self.candidates, self.level) if group is not None]
 
 
 def drawn_starts(
@@ -105,7 +129,8 @@ def drawn_starts(
     6.2): on a sphere, then moved onto the surface. Otherwise they are sets of the candidate
     contacts of `settled`, whose centroid may lie far from the object's centre. `seed` draws them.
     """
-    spec, candidates = settled
+    spec = settled.spec
+    candidates = settled.candidates
     generator = torch.Generator().manual_seed(seed)
     if candidates is not None:
         # the rows are drawn after the candidates
@@ -116,7 +141,7 @@ def drawn_starts(
             drawn = draw(shape, spec, (count, spec.fingertips), generator)
             yield project(shape, draw_in(shape, drawn), steps=6)
         else:
-            yield candidate_rows(problem, *candidates, count, generator)
+            yield candidate_rows(problem, settled.groups, count, generator)
 
 
 def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandidates:
@@ -146,9 +171,34 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
             counts = itertools.accumulate(len(sets) for sets in closed)
             if any(count >= ENOUGH_CLOSED * SURVEYED for count in counts):
                 break
+    level = None
+    if spec.plane is not None and settled.flat_radius in (spec.flat_radius, FLAT_RADII[-1]):
+        level = _find_level(shape, settled, spec.plane, seed)
     if int(flat.sum()) < spec.fingertips:
         flat = torch.ones_like(flat)
-    return FlatCandidates(settled, (points[flat], normals[flat]))
+    return FlatCandidates(settled, SurfacePoints(points[flat], normals[flat]), level)
+
+
+def _find_level(
+    shape: ShapeLike, spec: ContactSpec, plane: Plane, seed: int
+) -> SurfacePoints | None:
+    """Return the level candidates of an object on a table (`FlatCandidates`).
+
+    The result is None if there are fewer than fingertips.
+    """
+    assert spec.flatness is not None
+    generator = torch.Generator().manual_seed(seed)
+    points = survey(shape, spec, generator, LEVEL_SURVEY)
+    good, normals = qualify(shape, spec, points)
+    problem = ContactProblem.of(shape, spec)
+    steepest = math.atan(problem.friction) + math.radians(LEVEL)
+    rise = normals @ plane.normal.to(normals)
+    good &= rise < math.sin(min(steepest, math.pi / 2))
+    variation = normal_variation(shape, points, normals, problem.ring, good)
+    good &= variation < CANDIDATE_FLATNESS * spec.flatness
+    if int(good.sum()) < spec.fingertips:
+        return None
+    return SurfacePoints(points[good], normals[good])
 
 
 def draw(
@@ -165,16 +215,18 @@ def draw(
 
 
 def survey(
-    shape: ShapeLike, spec: ContactSpec, generator: torch.Generator
+    shape: ShapeLike, spec: ContactSpec, generator: torch.Generator, times: int = 1
 ) -> Float[Tensor, "_ f 3"]:
     """Return random points (normalised) all over the surface, from which candidate contacts are
     chosen.
 
     They come in sets of f = 3 points. For a vessel, half of them are on each wall. `generator`
-    draws them.
+    draws them, `times` as many as by default.
     """
     walls = walls_of(shape)
-    triples = CANDIDATE_TRIPLES * (1 if spec.region is None else 4)  # few of them lie in a region
+    if spec.region is not None:
+        times = max(times, 4)  # few of them lie in a region
+    triples = times * CANDIDATE_TRIPLES
     drawn = draw(shape, spec, (triples, 3), generator).tensor_split(len(walls))
     return torch.cat(
         [project(wall, points, steps=6) for wall, points in zip(walls, drawn, strict=True)]
@@ -223,25 +275,29 @@ def qualify(
 
 def candidate_rows(
     problem: ContactProblem,
-    points: Points,
-    normals: Points,
+    groups: Sequence[SurfacePoints],
     starts: int,
     generator: torch.Generator,
 ) -> Vectors:
     """Return b = `starts` random sets (b, f, 3) of candidate contacts, normalised, as initial
     guesses.
 
-    They have force closure, and contacts far enough from each other, as `problem` demands. If too
-    few drawn sets are like this, the others are random sets of candidates. `points` (p, 3) are the
-    normalised candidates, `normals` (p, 3) their outward unit normals. `generator` draws the sets.
+    They have force closure, and contacts far enough from each other, as `problem` demands. Each
+    set is drawn from one group of candidates. The first of the `groups` comes first, the next one
+    if too few drawn sets are like this. If there are still too few, the others are random sets of
+    the first group. `generator` draws the sets.
     """
     rows = []
     missing = starts
-    for good in good_sets(problem, points, normals, starts, generator):
-        rows.append(points[good[:missing]])
-        missing -= len(rows[-1])
+    for points, normals in groups:
         if missing == 0:
             break
+        for good in good_sets(problem, points, normals, starts, generator):
+            rows.append(points[good[:missing]])
+            missing -= len(rows[-1])
+            if missing == 0:
+                break
+    points, _ = groups[0]
     others = draw_sets(len(points), missing, problem.spec.fingertips, generator)
     return torch.cat([*rows, points[others.to(points.device)]])
 
