@@ -112,10 +112,15 @@ ROUND = RoundNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Revolution:
-    """A body of revolution about an axis along z, found in a cloud of n points."""
+    """A body of revolution about an axis along z, found among n points.
 
-    center: Float[Tensor, "2"]  # position (x, y) [m] of the axis, in the frame of the cloud
-    body: Bool[Tensor, "n"]  # mask of the cloud's points on the body
+    Args:
+        center: position (x, y) [m] of the axis, in the frame of the points.
+        body: mask of the points on the body.
+    """
+
+    center: Float[Tensor, "2"]
+    body: Bool[Tensor, "n"]
 
 
 def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution] | None:
