@@ -224,11 +224,12 @@ def check_grasps(path: Path | str, grasps: Grasps) -> None:
     known = torch.tensor([int(status) for status in Status], device="cpu")
     fingers = torch.arange(f, device="cpu")
     few = torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]], device="cpu")
+    sorted_fingers = grasps.permutation.sort(1).values
     wrong = {
         f"{f} fingertips, not three to five": few,
         "obj_from_hand that is not rigid": ~is_rigid(grasps.obj_from_hand),
         "an unknown status": ~torch.isin(grasps.status, known),
-        "a permutation that does not name each fingertip once": (grasps.permutation.sort(1).values != fingers).any(1),
+        "a permutation that does not name each fingertip once": (sorted_fingers != fingers).any(1),
     }
     for found in (name for name, rows in wrong.items() if bool(rows.any())):
         raise ModelFileError("path", f"{path}: {found}", "grasps that Grasps.save wrote")
