@@ -131,6 +131,28 @@ def test_files_that_are_no_arm_are_refused(hand, tmp_path):
         load("<robot")
 
 
+def test_a_sliding_joint_of_unknown_range_or_speed_is_refused(hand, tmp_path):
+    """A turn of 2 pi rad and pi rad/s are usual of arms: for a rail they would be 6.28 m, 3.14 m/s."""
+
+    def load(limit):
+        # a rail below the arm
+        rail = (
+            '<link name="floor"/><joint name="rail" type="prismatic"><parent link="floor"/>'
+            f'<child link="base_link"/><axis xyz="1 0 0"/>{limit}</joint></robot>'
+        )
+        (tmp_path / "arm.urdf").write_text(ur5e_urdf().replace("</robot>", rail))
+        return load_arm(tmp_path / "arm.urdf", hand)
+
+    arm = load('<limit lower="-1" upper="2" effort="100" velocity="0.5"/>')
+    assert (arm.lower[0], arm.upper[0], arm.speed[0]) == (-1.0, 2.0, 0.5)
+    for limit in ("", '<limit effort="9" velocity="1"/>'):
+        with pytest.raises(HandFileError, match=r"in metres, .*sliding joint rail without limits"):
+            load(limit)
+    for limit in ('<limit lower="0" upper="1"/>', '<limit lower="0" upper="1" velocity="0"/>'):
+        with pytest.raises(HandFileError, match=r"in m/s, .*sliding joint rail without a velocity"):
+            load(limit)
+
+
 def test_a_published_arm_with_meshes_is_cleaned_for_the_library(hand, tmp_path):
     """The forearm becomes a mesh; the spheres of the arm that is read again cover its vertices to a
     centimetre.

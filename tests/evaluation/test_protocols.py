@@ -55,6 +55,18 @@ def test_motions_in_degrees_and_millimetres_are_refused():
     assert PoseNoise(0.005, math.radians(45)).rotation == math.pi / 4
 
 
+def test_a_pull_lasts_as_long_as_it_says():
+    """The motion is checked every 0.2 s: a shorter pull would pass without any pull."""
+    for seconds, checks in ((0.2, 1), (0.6, 3), (1.4, 7), (2.0, 10), (60.0, 300)):
+        assert PullSpec(10.0, seconds, 0.05, 0.3).checks == checks
+    for seconds in (0.0, 0.05, 0.1, 0.15, 61.0):
+        with pytest.raises(BadArgument, match=r"seconds: expected a number in \[0\.2, 60\]"):
+            PullSpec(10.0, seconds, 0.05, 0.3)
+    for seconds in (0.25, 0.3, 0.5, 1.99):
+        with pytest.raises(BadArgument, match=r"seconds: expected a multiple of 0\.2 s"):
+            PullSpec(10.0, seconds, 0.05, 0.3)
+
+
 def test_errors_of_the_pose_stay_within_the_protocol_s():
     noise = PoseNoise(0.005, math.radians(5))
     errors = draw_hand_errors(noise, 600, seed=1)

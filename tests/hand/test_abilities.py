@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.make import load_hand
+from torchgrasp.app.cli.hands import describe_abilities
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand import hand_abilities
 from torchgrasp.hand.load import load_hand as read_hand
@@ -122,12 +123,16 @@ def test_jaws_that_overlap_are_not_free(gripper, tmp_path):
 
 
 def test_a_joint_of_unknown_effort_leaves_the_forces_of_other_fingers(gripper, tmp_path):
-    """A URDF without an effort has the effort 0."""
+    """A URDF without an effort has the effort 0: no force is known, which differs from no force."""
     text = (gripper / "hand.urdf").read_text().replace(f'effort="{TORQUE}"', 'effort="0"')
     (tmp_path / "hand.urdf").write_text(text)
     (tmp_path / "hand.toml").write_text((gripper / "hand.toml").read_text())
-    forces = [finger.force for finger in hand_abilities(read_hand(tmp_path)).fingers]
-    assert forces == pytest.approx([EFFORT, EFFORT, 0.0])
+    able = hand_abilities(read_hand(tmp_path))
+    for forces in ([x.force for x in able.fingers], [x.sure_force for x in able.fingers]):
+        assert forces == pytest.approx([EFFORT, EFFORT, math.nan], nan_ok=True)
+    assert able.content()["fingers"][2]["force_n"] is None
+    table = describe_abilities(able).splitlines()
+    assert table[4].split()[2:] == ["-", "-"]
 
 
 def test_forces_are_those_of_the_principle_of_virtual_work():

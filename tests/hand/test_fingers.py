@@ -54,6 +54,25 @@ def test_an_option_its_number_and_its_fingers_are_the_same_hand(wanted):
     assert hand.source.options == ("default", "four", "paper_literal")
 
 
+def test_an_option_of_the_same_fingers_parks_the_other_joints_elsewhere(toy_hand):
+    """Fingers that are chosen by name keep the positions that the hand has."""
+    toml = with_more_fingers(toy_hand, 4)
+    fingers = 'fingers = ["f1", "f2", "f3"]'
+    both = (
+        f"{fingers}\nparked = {{ j4 = 0.0 }}\n[options.aside]\n{fingers}\nparked = {{ j4 = 0.3 }}"
+    )
+    (toy_hand / "hand.toml").write_text(toml.replace(fingers, both))
+    hand = load_hand(toy_hand)
+    aside = with_fingers(hand, "aside")
+    assert aside.source.option == "aside"
+    assert torch.equal(aside.actuated.offset, load_hand(toy_hand, "aside").actuated.offset)
+    assert not torch.equal(aside.actuated.offset, hand.actuated.offset)
+    for back in ("default", 3, "3"):
+        assert torch.equal(with_fingers(aside, back).actuated.offset, hand.actuated.offset)
+    for same in ("aside", aside.finger_names, "f1,f2,f3"):
+        assert with_fingers(aside, same) is aside
+
+
 def test_each_finger_touches_where_it_does_in_the_options_of_three(generator):
     four = load_hand("allegro", 4)
     share = torch.rand(50, 16, generator=generator, dtype=torch.float64)

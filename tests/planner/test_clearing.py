@@ -8,7 +8,7 @@ import torch
 from tests.make import load_hand, see
 from torchgrasp import Status, plan_scene
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.foundation.errors import BadArgument, FailedRows
+from torchgrasp.foundation.errors import BadArgument, FailedRows, MissingExtra
 from torchgrasp.planner.changes import near_target
 from torchgrasp.planner.clearing import CLEARING, order_to_clear
 from torchgrasp.scene.removal import take_away
@@ -74,6 +74,14 @@ def test_what_is_in_the_way_goes_first_and_the_nearest_if_no_single_one_helps(cr
     assert order_to_clear(crowd, planned({2, 3}), 8) == (2, 3)
     assert order_to_clear(crowd, planned({4}), 8) == ()  # out of reach
     assert order_to_clear(crowd, planned(set(), least=9), 8) == ()  # it cannot be planned at all
+
+
+def test_an_error_of_the_call_is_no_count_of_grasps(crowd):
+    def plan(scene, **_):
+        raise MissingExtra("numba", "fast")
+
+    with pytest.raises(MissingExtra):
+        order_to_clear(crowd, plan, 8)
 
 
 def test_few_starts_count(crowd):

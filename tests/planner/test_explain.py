@@ -301,6 +301,7 @@ def test_more_starts_are_tried_where_nothing_helps_and_then_it_says_so(made_up):
     made_up(lambda t: (4, 0.2) if t.starts > 300 else (0, 0.0))
     explanation = explain_empty(VIEW, load_hand("barrett"), TABLE, starts=80)
     assert explanation.best is not None and explanation.best.words == "with 320 starts"
+    assert explanation.advice.endswith("with 320 starts: 4 executable grasps.")
 
 
 @pytest.mark.parametrize("fingers", [None, "auto"])

@@ -7,11 +7,13 @@ import torch
 
 from tests.make import load_hand, near, see
 from torchgrasp import ContactSpec, Status, load_scene, plan_grasps, plan_scene
-from torchgrasp.foundation.errors import BadArgument, NoEffect
+from torchgrasp.contacts.region import Region
+from torchgrasp.foundation.errors import BadArgument, MissingExtra, NoEffect, SuspiciousScale
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.planner.graspable import order_by_ease
 from torchgrasp.planner.objects import TARGET_POINTS, take_target
+from torchgrasp.success.task import GraspTask
 
 HAND = load_hand("barrett")
 
@@ -106,6 +108,48 @@ def test_targets_are_thinned_by_the_seed_and_wrong_arguments_are_named():
         plan_scene(dataclasses.replace(scene, labels=torch.zeros_like(scene.labels)), HAND)
     with pytest.raises(BadArgument, match="enough"):
         plan_scene(scene, HAND, enough=1.5)
+
+
+def test_a_wrong_argument_of_a_scene_raises_instead_of_being_the_reason_of_each_object(monkeypatch):
+    scene = load_scene()
+    far = Region.box(torch.full((3,), 5.0), torch.full((3,), 6.0))
+    displaced = GraspTask(displaced=True)
+    for wrong, message in (
+        ({"promise": 0.9, "task": displaced}, "promise: expected None"),
+        ({"keep": far}, "keep: expected a region on the object"),
+        ({"resist": ()}, "resist: expected at least one"),
+        ({"fingers": "none"}, "fingers: expected"),
+        ({"spec": ContactSpec(table=0.9)}, "table: expected"),
+        ({"reachable": lambda poses: poses[:, 0, 3]}, "reachable: expected a tensor of"),
+        ({"keep": lambda points: points}, "keep: expected a tensor of one finite number each"),
+    ):
+        for target in (None, 1):
+            with pytest.raises(BadArgument, match=message):
+                plan_scene(scene, HAND, starts=4, target=target, **wrong)
+
+    def missing(scene, **_):
+        raise MissingExtra("numba", "fast")
+
+    monkeypatch.setattr("torchgrasp.planner.scene_plan.plan_grasps", missing)
+    with pytest.raises(MissingExtra, match="numba is not installed"):
+        plan_scene(scene, HAND, starts=4)
+
+
+def test_an_object_whose_own_cloud_cannot_be_planned_keeps_its_reason(monkeypatch):
+    """A table of the call that is above one object, and under another, is no error of the call."""
+
+    def refused(scene, **_):
+        raise SuspiciousScale("cloud", "a size of 3 mm", "5 mm to 2 m")
+
+    monkeypatch.setattr("torchgrasp.planner.scene_plan.plan_grasps", refused)
+    plan = plan_scene(see((0.0, 0.0, 0.06, 0.12)), HAND, starts=4)
+    assert [thing.reason for thing in plan.things] == [
+        "cloud: expected 5 mm to 2 m, got a size of 3 mm"
+    ]
+    monkeypatch.undo()
+    high = see((0.0, 0.0, 0.06, 0.12), (0.15, 0.0, 0.06, 0.3))
+    plan = plan_scene(high, HAND, ContactSpec(table=0.1), starts=4, enough=0.0)
+    assert len(plan.things) == 2
 
 
 def test_a_low_table_that_takes_the_place_of_the_scenes_is_told(crowded):

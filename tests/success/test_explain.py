@@ -20,6 +20,7 @@ from torchgrasp.success import reasons as explain
 from torchgrasp.success.features import CAUSES, FEATURES, WEAK
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.reasons import SENTENCES, measure_again, stand_upright
+from torchgrasp.values.distribution import Distribution
 
 UNITS = {name: unit for names in CAUSES.values() for name, unit in names.items()}
 SHOWN = {
@@ -111,6 +112,22 @@ def test_a_heavier_object_makes_the_load_or_the_task_a_cause(use):
         use(stump(name, float(light + heavy) / 2, 1.0, -1.0))
         assert explain_success(*jug(), GraspTask(mass=0.05)) == ()
         assert [cost.cause for cost in explain_success(*jug(), GraspTask(mass=0.5))] == [cause]
+
+
+@pytest.mark.parametrize(
+    ("mass", "told"),
+    [
+        (0.1, ""),
+        (Distribution.parse("0.5:1.5"), "no trial supports [1-9][0-9]%"),
+        (2.0, "; no trial supports these frictions and masses, so the success is unknown$"),
+    ],
+)
+def test_what_no_trial_supports_of_the_task_is_told(mass, told):
+    sentences = {
+        cost.cause: cost.sentence for cost in explain_success(*jug(), GraspTask(mass=mass))
+    }
+    task = sentences.get("task", "")
+    assert re.search(told, task) if told else "no trial" not in task
 
 
 def test_the_frame_of_object_and_grasp_does_not_matter(motion):

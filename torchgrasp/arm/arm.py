@@ -75,7 +75,8 @@ class Arm(Value):
         tree: forward kinematics of this chain.
         lower: lower limits (n,) of the joints [rad or m].
         upper: upper limits (n,) of the joints [rad or m].
-        speed: greatest speed (n,) of each joint [rad/s or m/s]; pi if the URDF gives none.
+        speed: greatest speed (n,) of each joint [rad/s or m/s]. It is pi rad/s if the URDF gives
+            none for a turning joint.
         obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the object and its
             cloud.
         tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip.
@@ -237,7 +238,7 @@ def load_arm(
 
     Args:
         urdf: path of the file. Joint limits are cut to [-2 pi, 2 pi] rad, or m for sliding joints;
-            a joint without limits gets this range.
+            a turning joint without limits gets this range.
         hand: the hand on the arm, or its name, or its folder.
         tip: name of the link that carries the hand. None means the link that the most joints move.
             Of several such links, it means the last one in the file. A robot that branches, as
@@ -253,6 +254,7 @@ def load_arm(
         HandFileError: a collision mesh on a link between root and tip;
             `torchgrasp.app.author.clean_arm` replaces meshes.
         HandFileError: a joint between root and tip that mimics another joint.
+        HandFileError: a sliding joint between root and tip without limits, or without a velocity.
         BadArgument: no link is named `tip`, fewer than six joints move it, or a pose is not rigid.
         BadArgument: `tip` is None, and the robot branches; or the hand is over 1 m from the tip.
 
@@ -276,6 +278,7 @@ def load_arm(
             f"joint {followers[0]} that follows another",
             "joints that each have a drive, up to the tip",
         )
+    _check_sliding(whole, tip)
     way = tuple(
         dataclasses.replace(j, lower=max(j.lower, -turn), upper=min(j.upper, turn))
         for j in reversed(whole.joints_above(tip))
@@ -333,6 +336,22 @@ def load_arm(
     often = counts.gt(0).float().mean(1)
     # Others touch by construction.
     return dataclasses.replace(arm, pairs=pairs[often[owner] <= ALWAYS])
+
+
+def _check_sliding(whole: Urdf, tip: str) -> None:
+    """Raise `HandFileError` for a sliding joint, up to the tip, of unknown range or speed.
+
+    No length of a rail is usual, as a turn is for other joints.
+    """
+    for joint in whole.joints_above(tip):
+        if joint.kind != "prismatic":
+            continue
+        if math.isinf(joint.upper - joint.lower):
+            allowed = "a lower and an upper limit, in metres, of each sliding joint"
+            raise whole.wrong(f"sliding joint {joint.name} without limits", allowed)
+        if joint.velocity <= 0:
+            allowed = "a velocity above 0, in m/s, of each sliding joint"
+            raise whole.wrong(f"sliding joint {joint.name} without a velocity", allowed)
 
 
 def _last_link(whole: Urdf, names: list[str]) -> str:

@@ -30,6 +30,8 @@ LEAST_MASS = 1e-3  # least mass [kg] of a task, so that no load is zero
 
 TURNS = Range(0.0, math.pi / 4, "an angle in [0, pi / 4] rad, not in degrees")
 """The greatest errors [rad] of a rotation that are taken. One degree, given as 1, is refused."""
+PULL_INTERVAL = 0.2  # interval [s] at which the motion of a pulled object is checked
+MOST_PULL = 60.0  # longest pull [s]
 
 
 @checked
@@ -63,25 +65,34 @@ class PullSpec(Value):
 
     Args:
         acceleration: force of each pull, divided by the object's mass [m/s^2], 0 to 1000.
-        seconds: duration [s] of each pull, 0 to 60. It is rounded to a multiple of 0.2 s, after
-            which the motion is checked each time. At 0.1 s or less there is no pull.
+        seconds: duration [s] of each pull, a multiple of 0.2 s from 0.2 to 60. The motion is
+            checked every 0.2 s.
         distance: motion [m] of the object's centre of mass at which a pull fails, 0 to 0.5. It
             counts from the start of the trial, so it includes the closing.
         angle: rotation [rad] of the object, counted likewise, at which a pull fails: 0 to pi, or
             infinity for any rotation.
 
-    Raises `BadArgument` for a number outside its range.
+    Raises `BadArgument` for a number outside its range, or another duration.
     """
 
     acceleration: Annotated[float, Range(0.0, 1000.0)]
-    seconds: Annotated[float, Range(0.0, 60.0)]
+    seconds: Annotated[float, Range(PULL_INTERVAL, MOST_PULL)]
     distance: Displacement
     angle: Annotated[float, Range(0.0, math.inf)]
 
     def __post_init__(self) -> None:
-        """Raise `BadArgument` for an angle that no rotation reaches, as one in degrees."""
+        """Raise `BadArgument` for an angle that no rotation reaches, as one in degrees. Raise it
+        also for a duration that is no multiple of the interval of the checks.
+        """
         if math.pi < self.angle < math.inf:
             raise BadArgument("angle", self.angle, "radians in [0, pi], or infinity for no bound")
+        if not math.isclose(self.seconds, self.checks * PULL_INTERVAL):
+            raise BadArgument("seconds", self.seconds, f"a multiple of {PULL_INTERVAL:g} s")
+
+    @property
+    def checks(self) -> int:
+        """The number of times that the object's motion is checked in a pull."""
+        return round(self.seconds / PULL_INTERVAL)
 
 
 @checked

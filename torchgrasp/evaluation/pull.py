@@ -9,7 +9,14 @@ import numpy as np
 import torch
 
 from torchgrasp.evaluation.causes import find_cause
-from torchgrasp.evaluation.protocols import Protocol, PullSpec, draw_push, find_protocol, seed_of
+from torchgrasp.evaluation.protocols import (
+    PULL_INTERVAL,
+    Protocol,
+    PullSpec,
+    draw_push,
+    find_protocol,
+    seed_of,
+)
 from torchgrasp.evaluation.several_tries import run_lifts
 from torchgrasp.evaluation.summary import ProtocolResult
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, check_truth
@@ -22,7 +29,6 @@ from torchgrasp.geometry.frames import rotation_angle
 
 DIRECTIONS = tuple(np.array(sign) * axis for axis in np.eye(3) for sign in (-1.0, 1.0))
 """Directions of the pulls: -x, +x, -y, +y, -z, +z of the world."""
-INTERVAL = 0.2  # interval [s] at which the pulled object's motion is checked
 
 
 @checked
@@ -82,7 +88,7 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "allegro")
     >>> from torchgrasp.evaluation import Truth
-    >>> pull = PullSpec(10.0, 0.1, 0.05, 0.26)
+    >>> pull = PullSpec(10.0, 0.2, 0.05, 0.26)
     >>> protocol = dataclasses.replace(find_protocol("dexgraspbench"), pull=pull)
     >>> trial = GraspTrial(load_hand("allegro"), grasp, Truth(jug.mesh, jug.parts))
     >>> found = pull_grasp(trial, protocol)
@@ -138,8 +144,8 @@ def _pull(
     run.scene.pull(spec.acceleration * run.mass * direction)
     status = Status.OK
     largest = np.zeros(2)
-    for _ in range(round(spec.seconds / INTERVAL)):
-        run.hold(INTERVAL)
+    for _ in range(spec.checks):
+        run.hold(PULL_INTERVAL)
         status, motion = _look(run, spec, start)
         largest = np.maximum(largest, motion)
         if status is not Status.OK:

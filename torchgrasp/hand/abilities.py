@@ -47,14 +47,16 @@ class FingerAbility:
         joints: number of the actuated joints that move the tip.
         force: greatest normal force [N] of the tip, as the median over the free postures. NaN if in
             half of them no joint moves the contact point along its normal. The load is then carried
-            by the links, not by the motors.
+            by the links, not by the motors. It is also NaN if the effort of a joint that moves the
+            contact point is unknown.
         sure_force: normal force [N] that the tip reaches in 90 % of the free postures. NaN if no
-            joint moves the contact point along its normal in these postures.
+            joint moves the contact point along its normal in these postures, or if an effort is
+            unknown, as for `force`.
 
     Both forces act at the contact point of the pad, the part that touches objects, along the pad's
     normal. No other finger presses, and each actuated joint exerts at most its effort, its greatest
-    torque in the URDF. An effort that the URDF lacks counts as 0, and so gives a force of 0. A
-    posture is free if no links of the hand overlap.
+    torque in the URDF. An effort that the URDF lacks, or that is 0, is unknown. A posture is free
+    if no links of the hand overlap.
     """
 
     name: str
@@ -251,7 +253,8 @@ def _fingers(hand: Hand, levers: Float[Tensor, "n f h"]) -> tuple[FingerAbility,
     """
     effort = levers.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
     # The joint that reaches its effort first bounds the force. One without a lever does not, even
-    # if its effort is unknown, which is 0.
+    # if its effort is unknown, which the URDF's reader stores as 0.
+    effort = torch.where(effort > 0, effort, torch.nan)
     bounds = torch.where(levers == 0, math.inf, effort / levers.abs())
     force = bounds.amin(2)  # (n, f)
     moved = (hand.tree.moves[hand.tips.index] @ hand.actuated.coupling.abs()) > 0  # (f, h)
@@ -260,7 +263,8 @@ def _fingers(hand: Hand, levers: Float[Tensor, "n f h"]) -> tuple[FingerAbility,
         ranked = force[:, k].sort().values
         median = float(ranked[len(ranked) // 2])
         sure = float(ranked[int(ABILITY.sure * len(ranked))])
-        known = [x if math.isfinite(x) else math.nan for x in (median, sure)]
+        unknown = bool(ranked.isnan().any())
+        known = [math.nan if unknown or math.isinf(x) else x for x in (median, sure)]
         found.append(FingerAbility(name, hand.tips.links[k], int(moved[k].sum()), *known))
     return tuple(found)
 

@@ -126,6 +126,7 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
     """Return the same hand, on the same device, with other grasping fingers.
 
     The hand's files are read again. A hand that already has these fingers is returned as it is.
+    For an option, or a number, its other joints must also be where the option parks them.
 
     Args:
         hand: the hand.
@@ -140,9 +141,19 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
     """
     other = load_hand(hand.urdf_path.parent, fingers)
     if other.finger_names == hand.finger_names:
-        return hand
+        own = hand.actuated.offset.to("cpu")
+        parked = other.source.option == hand.source.option or _agree(own, other.actuated.offset)
+        if parked or _are_names(fingers, hand):
+            return hand
     check_as_loaded(hand)
     return other.to(hand.lower)
+
+
+def _are_names(fingers: Fingers, hand: Hand) -> bool:
+    """Return whether `fingers` are names of the hand's fingers: no option of hand.toml, no number."""
+    if isinstance(fingers, str) and fingers not in hand.source.options:
+        return tuple(fingers.split(",")) == hand.finger_names
+    return fingers == hand.finger_names
 
 
 def check_as_loaded(hand: Hand) -> None:

@@ -67,6 +67,7 @@ class Change:
         cures: the statuses of failed grasps or contact sets that the change could prevent.
         request: the request with the change.
         refit: whether the object's shape must be estimated anew.
+        more: whether the change is more initial guesses.
     """
 
     words: str
@@ -74,6 +75,7 @@ class Change:
     cures: frozenset[Status]
     request: Request
     refit: bool = False
+    more: bool = False
 
 
 def _with(request: Request, **fields: Any) -> Request:
@@ -94,7 +96,7 @@ def list_changes(request: Request) -> list[Change]:
 def more_starts(request: Request, ratio: int) -> Change:
     """Return a change of the request: to `ratio` times as many initial guesses as it has."""
     more = dataclasses.replace(request, starts=ratio * request.starts)
-    return Change(f"with {more.starts} starts", True, frozenset(Status), more)
+    return Change(f"with {more.starts} starts", True, frozenset(Status), more, more=True)
 
 
 def _regions(request: Request) -> Iterator[Change]:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from torchgrasp.foundation.errors import GraspError, Status
 from torchgrasp.planner.changes import near_target
+from torchgrasp.planner.request import is_of_call
 from torchgrasp.scene.removal import take_away
 from torchgrasp.scene.scene import Scene
 from torchgrasp.values.planning import Grasps
@@ -63,9 +64,12 @@ def order_to_clear(scene: Scene, plan: Callable[..., Grasps], starts: int) -> tu
 def count_grasps(plan: Callable[..., Grasps], scene: Scene) -> int:
     """Return the number of executable grasps that the function `plan` finds for a scene's target.
 
-    The number is 0 if `plan` raises a `GraspError`.
+    The number is 0 if `plan` raises a `GraspError`, unless the error is one of the call
+    (`is_of_call`).
     """
     try:
         return int((plan(scene).status == Status.OK).sum())
-    except GraspError:
+    except GraspError as error:
+        if is_of_call(error):
+            raise
         return 0

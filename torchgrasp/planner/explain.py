@@ -178,6 +178,7 @@ class Trial(Value):
         executable: number of executable grasps.
         expected: mean predicted success, in [0, 1], of the best grasps (`expected_success`).
         funnel: losses of the planning stages.
+        more: whether the change is more initial guesses, whose number is in `words`.
     """
 
     words: str
@@ -185,6 +186,7 @@ class Trial(Value):
     executable: int
     expected: float
     funnel: Funnel
+    more: bool = False
 
     def __str__(self) -> str:
         return f"{self.words}: {self.executable or 'no'} executable grasp{'s' * (self.executable != 1)}"
@@ -257,7 +259,9 @@ class Explanation(Value):
             return f"No single change helps ({tried}): {lost}."
         chosen = next((trial for trial in helpful if trial.choice), helpful[0])
         second = f"; {chosen}" if chosen is not helpful[0] else ""
-        return f"What would help most ({tried}): {helpful[0]}{second}, from {self.starts} starts."
+        # a change to more guesses names their number itself
+        number = "" if helpful[0].more else f", from {self.starts} starts"
+        return f"What would help most ({tried}): {helpful[0]}{second}{number}."
 
     def __str__(self) -> str:
         return f"{self.funnel}\n{self.advice}"
@@ -396,7 +400,9 @@ def _try_change(change: Change, known: Objects | None, tell: Observer) -> Trial:
     to the observer.
     """
     funnel, expected, _ = try_request(change.request, known)
-    trial = Trial(change.words, change.choice, funnel.executable, expected, funnel)
+    trial = Trial(
+        change.words, change.choice, funnel.executable, expected, funnel, more=change.more
+    )
     tell("change", str(trial), trial)
     return trial
 

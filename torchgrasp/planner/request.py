@@ -10,7 +10,7 @@ from torchgrasp.arm.arm import Arm
 from torchgrasp.cloud.agreement import check_where
 from torchgrasp.contacts.region import Region, combine
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra
 from torchgrasp.foundation.fused import are_on
 from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.hand.hand import Hand
@@ -37,6 +37,8 @@ Where = Callable[..., Any]
 """A `Region`, or a function that returns the signed distance [m] of points (n, 3) [m], negative
 inside.
 """
+FUNCTIONS = frozenset({"keep", "avoid", "spec.region", "reachable"})
+"""Names, in errors, of the caller's functions: what they return shows only while planning."""
 
 
 @checked
@@ -158,6 +160,17 @@ class Request:
     def hands(self) -> tuple[Hand, ...]:
         """The hands of the plan, one for each set of fingers that may grasp."""
         return finger_sets(self.hand, self.fingers, self.mode)
+
+
+def is_of_call(error: GraspError) -> bool:
+    """Return whether an `error` of planning is one of the call, which no other cloud would mend.
+
+    It tells of a package that is not installed, or of a function of the caller that returns what
+    it may not.
+    """
+    if isinstance(error, BadArgument):
+        return error.argument in FUNCTIONS
+    return isinstance(error, MissingExtra)
 
 
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:

@@ -13,13 +13,14 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, FailedRows, GraspError, Status
 from torchgrasp.foundation.rules import Count, Fraction, Measured, Seed
 from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.geometry.plane import Plane, upright_frame
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import Reachable
 from torchgrasp.planner.clearing import order_to_clear
 from torchgrasp.planner.explain import Funnel
 from torchgrasp.planner.graspable import is_vague, judge_things, order_by_ease
 from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.planner.request import Promised, Where, finger_sets
+from torchgrasp.planner.request import Promised, Request, Where, finger_sets, is_of_call
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.task import GraspTask, Resist
@@ -136,13 +137,14 @@ def plan_scene(
         task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
 
     Raises:
-        BadArgument: a scene without objects, an unknown `target`, unknown `fingers`, or an argument
-            of the wrong type or range.
+        BadArgument: a scene without objects, an unknown `target`, or any other argument that
+            `plan_grasps` refuses.
+        BadArgument: a table of `spec` that fits no object to plan, or a wrong result of a function.
         CloudFileError: a file of a scene that is missing or malformed.
         HandFileError: there is no such hand, or its files are malformed.
+        MissingExtra: numba is asked for and not installed.
 
-    If `plan_grasps` raises a `GraspError` for an object, `plan_scene` does not raise it: the
-    `reason` of the object's plan is its text.
+    If an object alone cannot be planned, the `reason` of its plan is the text of the `GraspError`.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=12, enough=0.5)
@@ -153,7 +155,24 @@ def plan_scene(
     hand = as_hand(hand, "hand")
     if not scene.things:
         raise BadArgument("scene", "no object on the table", "a scene with at least one object")
+    seen = scene if target is None else scene.select(target)
+    request = Request(
+        seen,
+        hand,
+        spec,
+        starts,
+        seed,
+        fingers=fingers,
+        task=task,
+        promise=promise,
+        reachable=reachable,
+        arm=arm,
+        keep=keep,
+        avoid=avoid,
+        resist=resist,
+    )
     finger_sets(hand, fingers)  # raises for unknown fingers
+    _check_table(seen, request.contact_spec.plane)
     plan = functools.partial(
         plan_grasps,
         hand=hand,
@@ -171,7 +190,7 @@ def plan_scene(
     )
     judged = judge_things(scene, hand, spec)
     if target is not None:
-        return _plan_target(scene.select(target), judged[target], plan, starts)
+        return _plan_target(seen, judged[target], plan, starts)
     plans: list[ThingPlan] = []
     for label in order_by_ease(scene):
         if judged[label] is not Status.OK:
@@ -189,6 +208,25 @@ def plan_scene(
         )
     )
     return ScenePlan(tuple(plans))
+
+
+def _check_table(scene: Scene, table: Plane | None) -> None:
+    """Raise `BadArgument` for a given table that is under none of the objects to plan.
+
+    With a target it is the only one of them. No error is raised without a given table.
+    """
+    if table is None:
+        return
+    labels = scene.things if scene.target is None else (scene.target,)
+    wrong: BadArgument | None = None
+    for label in labels:
+        try:
+            upright_frame(scene.cloud(label).points, scene.viewpoint, table)
+            return
+        except BadArgument as error:
+            wrong = error
+    assert wrong is not None
+    raise wrong
 
 
 def _plan_target(
@@ -216,6 +254,8 @@ def _judged_thing(label: int, judged: Status) -> ThingPlan:
 def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
     """Return the plan of a scene's target object by the function `plan`, or the reason why it has
     no grasp.
+
+    Raises an error of the call (`is_of_call`).
     """
     assert scene.target is not None
     stages: dict[str, Any] = {}
@@ -229,6 +269,8 @@ def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
     try:
         grasps = plan(scene, observer=note)
     except GraspError as error:
+        if is_of_call(error):
+            raise
         return ThingPlan(
             scene.target, 0.0, reason=str(error), status=stages.get("vague", Status.OK)
         )

@@ -89,9 +89,9 @@ def explain_success(
     lifted object, the `log_odds` of "load" are greater (`lost_by_weakness`). Causes that do not
     lower the success are left out.
 
-    If trials have tested some of the task's frictions and masses, but not all, "task" is always
-    among the causes. Its `log_odds` may then be negative. Its sentence says what share of the
-    frictions and masses no trial has tested.
+    If trials have not tested all of the task's frictions and masses, "task" is always among the
+    causes. Its `log_odds` may then be negative. Its sentence says what share of the frictions and
+    masses no trial has tested. If trials have tested none, it says that the success is unknown.
 
     Args:
         grasps: grasps of `plan_grasps`, of which the first counts.
@@ -141,11 +141,13 @@ def explain_success(
             sentence += _say_carried(float(carried))
         told.append(Cost(cause, gain, sentence))
     lower = [cost for cost in sorted(told, key=lambda cost: -cost.log_odds) if cost.log_odds > 0]
-    if not 0 < supported < 1 - ROUNDING:
+    if supported >= 1 - ROUNDING:
         return tuple(lower[:MOST])
     # the task is told in any case, with what no trial supports of it
     given = told[-1]
-    unknown = f"no trial supports {1 - supported:.0%} of these frictions and masses"
+    unknown = "no trial supports these frictions and masses, so the success is unknown"
+    if supported > 0:
+        unknown = f"no trial supports {1 - supported:.0%} of these frictions and masses"
     said = given._replace(sentence=f"{given.sentence}; {unknown}")
     others = [cost for cost in lower if cost.cause != given.cause]
     kept = [*others[: MOST - 1], said]

@@ -3,6 +3,7 @@ hand that grasps.
 """
 
 import dataclasses
+import math
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -324,8 +325,9 @@ def describe_sets(hand: Hand) -> str:
 def describe_abilities(abilities: HandAbilities) -> str:
     """Return a text with the abilities of a hand with one set of fingers, as two tables.
 
-    One has the force [N] of each fingertip. The other has a line for each two fingertips: their
-    least and greatest distance [m], and the widths [m] that they can hold.
+    One has the force [N] of each fingertip, or "-" if it is unknown. The other has a line
+    for each two fingertips: their least and greatest distance [m], and the widths [m] that they can
+    hold.
     """
     widths = f"{abilities.least_width:.3f} to {abilities.greatest_width:.3f} m"
     # a hand of which no two tips ever face each other
@@ -333,8 +335,9 @@ def describe_abilities(abilities: HandAbilities) -> str:
         widths = "none"
     rows = [("finger", "joints", "force [N]", "in 9 of 10 [N]")]
     for finger in abilities.fingers:
-        forces = f"{finger.force:.1f}", f"{finger.sure_force:.1f}"
-        rows.append((finger.name, str(finger.joints), *forces))
+        force = _say_force(finger.force)
+        sure = _say_force(finger.sure_force)
+        rows.append((finger.name, str(finger.joints), force, sure))
     between = [("tips", "span [m]", "holds [m]", "face each other")]
     for pair in abilities.pairs:
         span = f"{pair.least_span:.3f} to {pair.greatest_span:.3f}"
@@ -345,6 +348,11 @@ def describe_abilities(abilities: HandAbilities) -> str:
         f"postures are free; two tips hold widths of {widths}\n"
         f"{format_columns(rows, left={0})}\n{format_columns(between, left={0})}"
     )
+
+
+def _say_force(force: float) -> str:
+    """Return a force [N] as text; "-" for NaN, an unknown one."""
+    return "-" if math.isnan(force) else f"{force:.1f}"
 
 
 def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
