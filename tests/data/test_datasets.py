@@ -226,6 +226,15 @@ def test_a_mesh_that_falls_over_is_told(tmp_path):
         write_objects(tmp_path / name, tmp_path / f"{name} out", views=1)
 
 
+@pytest.mark.parametrize("name", ["mug ", ".mug", "mug.", "a:b", "a\\b", "m\tug", 101 * "m"])
+def test_a_mesh_of_a_name_that_readers_refuse_is_refused_before_work(tmp_path: Path, name: str):
+    trimesh.creation.box((0.06, 0.08, 0.1)).export(tmp_path / "mesh.stl")
+    (tmp_path / "mesh.stl").rename(tmp_path / f"{name}.stl")
+    with pytest.raises(DatasetError, match="meshes: expected a printable name of 1 to 100 bytes"):
+        write_objects(tmp_path, tmp_path / "out", views=1)
+    assert not (tmp_path / "out").exists()
+
+
 def test_no_meshes_two_of_a_name_and_an_open_one_are_refused(tmp_path: Path):
     with pytest.raises(BadArgument, match="without meshes"):
         write_objects(tmp_path, tmp_path / "out")

@@ -43,6 +43,8 @@ MISNAMED = {"mass": "mass_kg", "scale": "suggested_scale"}
 UNREAD = (".glb", ".gltf", ".dae", ".3mf", ".fbx", ".usd", ".usda", ".usdc", ".usdz", ".step")
 """Endings of meshes that `write_objects` does not read."""
 NAME_BYTES = 100  # longest name: file names have 255 bytes
+PLAIN = f"a printable name of 1 to {NAME_BYTES} bytes without / \\ : or a dot or space at its ends"
+"""What names are allowed, in errors."""
 SHOWN_NAMES = 100  # most names that an error message quotes
 
 
@@ -193,7 +195,8 @@ def write_objects(
     or in folders, which are not read.
 
     Raises:
-        DatasetError: there are no meshes, or two meshes of one name.
+        DatasetError: there are no meshes, or two meshes of one name, or a name that the readers of
+            the folder refuse. An example is one with a space at its end.
         DatasetError: `out` has a manifest with other objects, or with entries besides "views".
         MeshError: a mesh is malformed, open or without volume.
         OutputError: the folder cannot be written.
@@ -215,6 +218,8 @@ def write_objects(
             found = f"{meshes}, {missing}"
         allowed = f"a folder of files {', '.join(SUFFIXES)}, each of its own name"
         raise DatasetError("meshes", found, allowed)
+    if odd := [path.name for path in files if not _is_plain(path.stem)]:
+        raise DatasetError("meshes", f"{meshes} with the file {odd[0][:NAME_BYTES]!r}", PLAIN)
     _check_replaced(Path(out), names)
     written = {Path(out).resolve(), *((Path(out) / name).resolve() for name in names)}
     if left := [path.name for path in sorted(Path(meshes).iterdir()) if _is_left(path, written)]:
@@ -331,13 +336,16 @@ def _check_name(field: Field, name: str) -> None:
     """Raise the field's error for a name that is more than one part of a path. Raise it also for
     one that is not printable.
     """
+    if not _is_plain(name):
+        raise field.refuse(f"{field.path}: the name {name[:NAME_BYTES]!r}", PLAIN)
+
+
+def _is_plain(name: str) -> bool:
+    """Return whether a name of an object or a view is one part of a path, printable, and not too
+    long.
+    """
     plain = name.isprintable() and not set(name) & set("/\\:") and name == name.strip(" .")
-    if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= NAME_BYTES:
-        allowed = (
-            f"a printable name of 1 to {NAME_BYTES} bytes "
-            "without / \\ : or a dot or space at its ends"
-        )
-        raise field.refuse(f"{field.path}: the name {name[:NAME_BYTES]!r}", allowed)
+    return plain and 0 < len(name.encode("utf-8", "surrogatepass")) <= NAME_BYTES
 
 
 @checked
