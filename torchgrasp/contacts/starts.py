@@ -37,8 +37,10 @@ LEAST_PORTION = 4000  # sets judged at once: a few take as long, as each operati
 # share of starts, and of how many, that must be closed: contacts can be so flat
 ENOUGH_CLOSED = 0.1
 SURVEYED = 250
-# of points about which closed sets are rare, so many times more are drawn
-LEVEL_SURVEY = 8
+# share of drawn sets of candidates that is closed, at or below which level candidates are drawn,
+# too: of 1000 starts, at most 16 would be closed
+RARE = 1e-4
+LEVEL_SURVEY = 8  # so many times more points are drawn to find them
 # largest angle [deg] by which a level candidate's normal may rise beyond the half angle of the
 # friction cone: with one that rises less, a contact can push up or along the table
 LEVEL = 5.0
@@ -104,9 +106,9 @@ class FlatCandidates(NamedTuple):
     the constraints. The `candidates` are None if the surface need not be flat.
 
     `level` are further candidates, for a low object on a table. Its contacts must be high, as a
-    fingertip is above the table. Most of them lie on its top, and few sets of them have force
+    fingertip is above the table. Most of them lie on its top, and hardly any set of them has force
     closure. The normals of level candidates rise so little that a contact can push up or along the
-    table. They are None where sets with force closure are not rare.
+    table. They are None where sets with force closure are not rare (`RARE`).
     """
 
     spec: ContactSpec
@@ -151,7 +153,8 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
     largest with which at least 25 sets of candidates with force closure are found, else 3 mm. The
     candidates are random surface points at which the surface is flat. If fewer points than
     fingertips are flat, the candidates are all drawn points. They are None if `spec` demands no
-    flatness. `seed` draws the points.
+    flatness. With a table, level candidates are found, too, where hardly any set has force closure.
+    `seed` draws the points.
     """
     if spec.flatness is None:
         return FlatCandidates(spec, None)
@@ -171,12 +174,23 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
             counts = itertools.accumulate(len(sets) for sets in closed)
             if any(count >= ENOUGH_CLOSED * SURVEYED for count in counts):
                 break
+    few = int(flat.sum()) < spec.fingertips
     level = None
     if spec.plane is not None and settled.flat_radius in (spec.flat_radius, FLAT_RADII[-1]):
-        level = _find_level(shape, settled, spec.plane, seed)
-    if int(flat.sum()) < spec.fingertips:
+        if few or _are_rare(problem, points[flat], normals[flat], seed):
+            level = _find_level(shape, settled, spec.plane, seed)
+    if few:
         flat = torch.ones_like(flat)
     return FlatCandidates(settled, SurfacePoints(points[flat], normals[flat]), level)
+
+
+def _are_rare(problem: ContactProblem, points: Points, normals: Points, seed: int) -> bool:
+    """Return whether hardly any random sets of the candidates have force closure (`RARE`)."""
+    generator = torch.Generator().manual_seed(seed)
+    closed = good_sets(problem, points, normals, SURVEYED, generator)
+    counts = itertools.accumulate(len(sets) for sets in closed)
+    most = RARE * ROUNDS * DRAWN_PER_START * SURVEYED
+    return not any(count > most for count in counts)
 
 
 def _find_level(
