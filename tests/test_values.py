@@ -321,3 +321,9 @@ def test_numbers_of_numpy_are_taken_without_a_warning(kind):
     assert ContactSpec(friction=kind(0.5)).friction == 0.5
     with pytest.raises(BadArgument, match=r"friction: expected .*got -0\.5"):
         ContactSpec(friction=kind(-0.5))
+
+
+def test_sentences_of_statuses_say_what_is_measured_and_counted():
+    """Pulls measure motion in the world from the start; a cluster may try more than twice."""
+    assert "in the hand" not in Status.MOVED.sentence and "closing" in Status.MOVED.sentence
+    assert "twice" not in Status.WORKER_DIED.sentence

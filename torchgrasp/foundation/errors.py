@@ -318,7 +318,7 @@ class Status(enum.IntEnum):
     NOT_LIFTED = 43, "the object stayed behind when the hand was lifted"
     EJECTED = 44, "the object was pushed out while the hand closed"
     UNSTABLE = 45, "the simulation did not stay finite"
-    MOVED = 46, "the object moved or turned too far in the hand when it was pulled"
+    MOVED = 46, "the object moved or turned too far while it was pulled, counting the closing"
     TOO_WEAK = 47, "the hand's drives were at their largest torque and the object was not held"
     SLIPPED = 48, "the object was lifted, but slipped or turned too far in the hand"
     TOO_HEAVY = (
@@ -328,5 +328,5 @@ class Status(enum.IntEnum):
     # the run
     BAD_OBJECT = 60, "the files of the object are not what they should be"
     TIMED_OUT = 61, "it took longer than its limit and was ended"
-    WORKER_DIED = 62, "the process that worked on it died, twice"
+    WORKER_DIED = 62, "the process that worked on it died, in each attempt"
     BROKEN = 63, "an error within the library ended the work on it"
