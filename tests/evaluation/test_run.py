@@ -228,7 +228,7 @@ def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(
         "torchgrasp.planner.run.expected_success", lambda grasps: grasps.contacts.points.shape[1]
     )
     test = PROTOCOLS["dexgraspbench"]
-    test = dataclasses.replace(test, pull=dataclasses.replace(test.pull, seconds=0.1))
+    test = dataclasses.replace(test, pull=dataclasses.replace(test.pull, seconds=0.2))
     spec = EvaluationSpec(1, starts=3, only=("tin",), fingers="auto")
     (score,) = evaluate(folder, load_hand("allegro"), test, spec, folder=tmp_path)
     assert score.fingers == "index,middle,ring,thumb" and len(score.attempts) == 1

@@ -95,9 +95,9 @@ def test_success_is_explained_under_the_distribution(planned):
     assert costs and all(cost.log_odds > 0 for cost in costs)
     told = {cost.cause: cost.sentence for cost in costs}
     heavy = explain_success(
-        grasps, load_hand("barrett"), shape, GraspTask(mass=Distribution.parse("3:5"))
+        grasps, load_hand("barrett"), shape, GraspTask(mass=Distribution.parse("0.7:0.9"))
     )
-    assert "the task is 4 kg at a friction of 0.66" in [cost.sentence for cost in heavy], told
+    assert "the task is 0.8 kg at a friction of 0.66" in [cost.sentence for cost in heavy], told
 
 
 def test_what_no_trial_supports_is_told(planned):

@@ -324,6 +324,19 @@ def test_a_table_with_an_edge_is_a_box_around_all_that_is_near(offset):
         dataclasses.replace(spec, edge=(0.0, 2.0, offset))
 
 
+def test_frictions_that_no_pair_of_surfaces_has_are_refused():
+    """With the mean of two surfaces a fingertip has twice its friction less that of the object."""
+    mesh = slab(0.0)
+    spec = SceneSpec("", np.eye(4), {}, {}, (), mesh, [mesh], 0.1, friction=0.3, table_friction=0.6)
+    assert spec.body_friction == 0.6
+    with pytest.raises(BadArgument, match=r"table_friction: .*at most 2 friction, 0.6, got 0.7"):
+        dataclasses.replace(spec, table_friction=0.7)
+    with pytest.raises(BadArgument, match=r"table_friction: .*got -0.1"):
+        dataclasses.replace(spec, table_friction=-0.1)
+    with pytest.raises(BadArgument, match=r"friction: expected a number >= 0, got -0.3"):
+        dataclasses.replace(spec, friction=-0.3)
+
+
 def test_only_vertices_behind_the_edge_are_moved_up_to_the_table():
     """A block that stands on the table has a hook that hangs down beyond the edge."""
     mesh = slab(0.0)

@@ -139,12 +139,14 @@ class SceneSpec:
             shift.
         start: initial displacement (x, y, z) [m] of the mount by such a shift; without effect if
             `yields` is 0.
-        table_friction: friction coefficient of objects with the table and with each other; None
-            means `friction`.
+        table_friction: friction coefficient of objects with the table and with each other, at most
+            2 `friction`; None means `friction`. SAPIEN takes the mean of two surfaces, so a greater
+            one would need fingertips of negative friction.
         mount: all prismatic joints of the mount, each a `Slide`, from the world to the hand. None
             means those that `travel`, `approach` and `yields` need.
 
-    Raises `BadArgument` for an edge whose vector is not of unit length.
+    Raises `BadArgument` for an edge whose vector is not of unit length, a negative `friction`, and a
+    `table_friction` that is not in [0, 2 friction].
     """
 
     urdf_path: Path | str
@@ -172,6 +174,12 @@ class SceneSpec:
     edge: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
+        if not self.friction >= 0:
+            raise BadArgument("friction", self.friction, "a number >= 0")
+        most = 2 * self.friction
+        if not 0 <= self.body_friction <= most:
+            allowed = f"at least 0 and at most 2 friction, {most:g}"
+            raise BadArgument("table_friction", self.body_friction, allowed)
         if self.edge is None:
             return
         length = math.hypot(*self.edge[:2])
